@@ -1,0 +1,22 @@
+"""Massively parallel DQN training of a quadruped that balances on a tilting board.
+
+`BalanceEnv` needs JAX and is imported on first use, so that `load_policy` works
+where JAX is not installed.
+"""
+
+from typing import TYPE_CHECKING
+
+from mjx_balance.policy import load_policy
+
+if TYPE_CHECKING:
+    from mjx_balance.env import BalanceEnv
+
+__all__ = ["BalanceEnv", "load_policy"]
+
+
+def __getattr__(name: str) -> object:
+    if name == "BalanceEnv":
+        from mjx_balance.env import BalanceEnv
+
+        return BalanceEnv
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

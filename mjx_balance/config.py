@@ -1,0 +1,360 @@
+"""Every number of the task, the robot and the training, with its unit and source.
+
+The dataclasses are frozen: a config is a value. Nothing else in the package
+restates one of these numbers. `check` turns an impossible combination into one
+sentence (`ConfigError`) before anything is built or written.
+
+Sources: "paper n" is a section of the paper, "Go2" the Unitree Go2's published
+dimensions, "chosen" a number the paper does not give.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar
+
+T = TypeVar("T")
+
+ACTION_AXES = 2  # roll and pitch, paper Eq. 3
+
+
+class ConfigError(ValueError):
+    """A config that cannot be run; the message names the field and a remedy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotConfig:
+    """Dimensions of `scenes/quadruped.xml`, compared with the compiled model by a test."""
+
+    legs: tuple[str, ...] = ("LF", "RF", "LH", "RH")
+    """Leg prefixes in observation order (paper Eq. 2)."""
+    hip_x: float = 0.193
+    """Fore-aft distance of the hips from the trunk centre, m (Go2)."""
+    hip_y: float = 0.0465
+    """Lateral distance of the abduction axes from the trunk centre, m (Go2)."""
+    abduction_offset: float = 0.0955
+    """Lateral distance from the abduction axis to the leg plane, m (Go2)."""
+    thigh: float = 0.213
+    """Hip to knee, m (Go2)."""
+    calf: float = 0.213
+    """Knee to foot centre, m (Go2)."""
+    foot_radius: float = 0.022
+    """m (Go2)."""
+    trunk_mass: float = 6.92
+    """kg (Go2)."""
+    total_mass: float = 15.2
+    """kg (Go2)."""
+    knee_min: float = -2.72
+    """rad (Go2)."""
+    knee_max: float = -0.838
+    """rad (Go2)."""
+    hip_torque: float = 23.7
+    """Limit of the abduction and hip servos, N m (Go2)."""
+    knee_torque: float = 45.4
+    """Limit of the knee servos, N m (Go2)."""
+    servo_stiffness: float = 400.0
+    """Position gain of the leg servos, N m / rad (chosen)."""
+    servo_damping: float = 16.0
+    """Damping of the leg joints, N m s / rad (chosen)."""
+    foot_friction: float = 0.8
+    """Sliding friction of a foot on the board (chosen)."""
+
+    @property
+    def half_track(self) -> float:
+        """Lateral distance of a foot from the trunk centre, m."""
+        return self.hip_y + self.abduction_offset
+
+    @property
+    def height_range(self) -> tuple[float, float]:
+        """Least and greatest body height above a foot's contact point, m (knee range)."""
+
+        def height(knee: float) -> float:
+            squared = self.thigh**2 + self.calf**2 + 2 * self.thigh * self.calf * math.cos(knee)
+            return math.sqrt(squared) + self.foot_radius
+
+        return height(self.knee_min), height(self.knee_max)
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskConfig:
+    """The control problem (paper section 3)."""
+
+    sim_dt: float = 0.004
+    """Physics step, s (paper 3.1)."""
+    ctrl_dt: float = 0.2
+    """One decision, s (paper 3.1: 5 Hz)."""
+    body_height: float = 0.35
+    """Standing height of the trunk above the board, foot radius included, m (paper 3.1)."""
+    max_incline: float = 7.0
+    """Greatest board tilt, deg (paper 3.1)."""
+    board_rate: float = 3.5
+    """Board speed on each axis, deg/s (paper 3.1)."""
+    square_share: float = 0.0
+    """Share of training targets drawn from the whole square of both axes, each uniform in
+    +-max_incline, instead of the paper's disc (paper: none)."""
+    target_period: float = 10.0
+    """Time between board targets, s (paper 3.1)."""
+    fail_tilt: float = 6.0
+    """Body tilt that counts as a fall, deg (paper 3.1)."""
+    action_max: float = 0.003
+    """Greatest height change of one decision on one axis, m (paper Eq. 3)."""
+    action_levels: int = 21
+    """Height changes per axis (paper Eq. 3: n = 0..20)."""
+    action_ramp: float = 0.4
+    """Share of a decision in which the legs reach their new heights (chosen: the gyro then
+    reads the board's own rate before the next decision)."""
+    gyro_lags: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    """Gyro samples in the observation, physics steps back (paper Eq. 2)."""
+    accel_lags: tuple[int, ...] = (0, 2, 4, 6, 8, 10, 12, 14, 15)
+    """Accelerometer samples in the observation, physics steps back (paper Eq. 2)."""
+    height_scale: float = 0.01
+    """Foot height, less the standing height, that enters the network as 1, m (chosen)."""
+    gyro_scale: float = math.radians(1.0)
+    """Angular rate that enters the network as 1, rad/s (chosen: 1 deg/s)."""
+    accel_scale: float = 9.81 * math.sin(math.radians(1.0))
+    """Acceleration that enters the network as 1, m/s^2 (chosen: 1 deg of tilt)."""
+    reward_level: float = 0.4
+    """Reward for a level body (paper Eq. 4)."""
+    reward_sharpness: float = 1.5
+    """Decay of that reward with the body tilt, 1/deg (paper Eq. 4)."""
+    reward_toward: float = 0.2
+    """Greatest reward for moving toward the horizontal (paper Fig. 5; height chosen)."""
+    reward_toward_scale: float = 1.0
+    """Change of tilt that earns it, deg (paper Fig. 5; scale chosen)."""
+    reward_fail: float = -0.5
+    """Added on a fall (paper 3.2)."""
+    episode_length: int = 300
+    """Decisions until an episode is truncated (chosen: 60 s)."""
+
+    @property
+    def sim_steps(self) -> int:
+        """Physics steps per decision."""
+        return round(self.ctrl_dt / self.sim_dt)
+
+    @property
+    def ramp_steps(self) -> int:
+        """Physics steps in which the legs reach their new heights, at least one."""
+        return max(1, round(self.action_ramp * self.sim_steps))
+
+    @property
+    def history(self) -> int:
+        """IMU samples that the observation looks back on, the newest included."""
+        return max(*self.gyro_lags, *self.accel_lags) + 1
+
+    @property
+    def num_actions(self) -> int:
+        """Size of the joint action set (paper: 21 x 21)."""
+        return self.action_levels**ACTION_AXES
+
+
+@dataclasses.dataclass(frozen=True)
+class DQNConfig:
+    """The learner (paper sections 2 and 3.2); it knows nothing of the robot."""
+
+    gamma: float = 0.1
+    """Discount (paper 3.2)."""
+    learning_rate: float = 1e-5
+    """Adam step size (paper 3.2)."""
+    learning_rate_end: float = 1e-5
+    """Adam step size at the end of a cosine decay over the run (paper: constant)."""
+    batch_size: int = 512
+    """Transitions per gradient step (chosen)."""
+    updates_per_step: int = 4
+    """Gradient steps after each decision of all envs (chosen)."""
+    replay_capacity: int = 131_072
+    """Transitions kept, rounded down to whole batches of num_envs (chosen)."""
+    min_replay_size: int = 4_096
+    """Transitions stored before learning begins (chosen)."""
+    target_update_period: int = 200
+    """Gradient steps between copies into the target network (chosen)."""
+    epsilon_start: float = 1.0
+    """Share of random actions at first (chosen)."""
+    epsilon_end: float = 0.05
+    """Share of random actions after the decay (chosen)."""
+    epsilon_decay_steps: int = 50_000
+    """Env steps over which epsilon falls linearly (chosen)."""
+    hidden_sizes: tuple[int, ...] = (256, 256)
+    """Widths of the Q-network's hidden layers (chosen)."""
+    head: Literal["joint", "factored"] = "joint"
+    """One output per action, or one per level and axis, added up."""
+    double: bool = False
+    """Double DQN (van Hasselt et al. 2015) instead of Eq. 1's max over the target network."""
+    max_grad_norm: float = 10.0
+    """Global-norm gradient clipping (chosen)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """A whole run."""
+
+    preset: str = "default"
+    """Where the other values start from."""
+    seed: int = 0
+    """Seed of everything random."""
+    num_envs: int | None = None
+    """Boards simulated at once; none: sized to the device."""
+    num_env_steps: int = 200_000
+    """Decisions of the run, over all boards (paper 4: about 200k)."""
+    num_devices: int | None = None
+    """JAX devices to spread the boards over; none: one per CPU core, or all accelerators."""
+    log_every: int = 4_096
+    """Env steps between two lines of metrics."""
+    checkpoint_every: int = 100_000
+    """Env steps between two checkpoints."""
+    eval_scenarios: int = 256
+    """Scenarios per suite of the evaluation after training."""
+    eval_duration: float = 60.0
+    """Length of each of them, s."""
+    task: TaskConfig = dataclasses.field(default_factory=TaskConfig)
+    robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
+    dqn: DQNConfig = dataclasses.field(default_factory=DQNConfig)
+
+
+PRESETS: Mapping[str, Config] = {
+    "paper": Config(preset="paper"),
+    "default": Config(
+        preset="default",
+        task=TaskConfig(square_share=0.5),
+        dqn=DQNConfig(
+            learning_rate=1e-3,
+            learning_rate_end=1e-5,
+            batch_size=512,
+            updates_per_step=8,
+            epsilon_decay_steps=40_000,
+            head="factored",
+        ),
+    ),
+    "smoke": Config(
+        preset="smoke",
+        num_envs=64,
+        num_env_steps=8_192,
+        log_every=1_024,
+        eval_scenarios=16,
+        eval_duration=20.0,
+        dqn=DQNConfig(
+            learning_rate=1e-3,
+            batch_size=256,
+            updates_per_step=4,
+            min_replay_size=512,
+            replay_capacity=8_192,
+            epsilon_decay_steps=4_096,
+            head="factored",
+        ),
+    ),
+}
+"""Named starting points of the command line."""
+
+
+def preset(name: str) -> Config:
+    """Returns the preset called `name`; raises `ConfigError` with the known names."""
+    if name not in PRESETS:
+        raise ConfigError(f"unknown preset {name!r}; known presets: {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def check(config: Config) -> Config:
+    """Returns `config` if it can be run; raises `ConfigError` with one sentence if not."""
+    task, robot, dqn = config.task, config.robot, config.dqn
+    for section in (config, task, robot, dqn):
+        for field in dataclasses.fields(section):
+            value = getattr(section, field.name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ConfigError(f"{field.name} is {value}; it must be a finite number")
+            if field.name in _POSITIVE and value is not None and not value > 0:
+                raise ConfigError(f"{field.name} is {value}; it must be greater than 0")
+            if field.name in _UNIT and not 0 <= value <= 1:
+                raise ConfigError(f"{field.name} is {value}; it must lie between 0 and 1")
+    steps = task.ctrl_dt / task.sim_dt
+    if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
+        raise ConfigError(
+            f"ctrl_dt is {task.ctrl_dt} s; it must be a whole multiple of sim_dt, {task.sim_dt} s"
+        )
+    if not 0 < task.action_ramp:
+        raise ConfigError(f"action_ramp is {task.action_ramp}; it must be greater than 0")
+    if task.action_levels < 3 or task.action_levels % 2 == 0:
+        raise ConfigError(
+            f"action_levels is {task.action_levels}; it must be odd and at least 3, "
+            "so that standing still is an action"
+        )
+    for name in ("gyro_lags", "accel_lags"):
+        lags = getattr(task, name)
+        if not lags or min(lags) < 0:
+            raise ConfigError(f"{name} is {lags}; it must hold at least one lag, none negative")
+    ramp = 2 * task.max_incline / task.board_rate
+    if ramp > task.target_period:
+        raise ConfigError(
+            f"target_period is {task.target_period} s, but a board ramp may last "
+            f"2 * max_incline / board_rate = {ramp:g} s; the period must not be shorter"
+        )
+    if not 0 < task.fail_tilt < 90:
+        raise ConfigError(f"fail_tilt is {task.fail_tilt}; it must lie between 0 and 90 deg")
+    if task.max_incline >= 45:
+        raise ConfigError(f"max_incline is {task.max_incline}; it must be less than 45 deg")
+    lowest, highest = robot.height_range
+    slope = math.tan(math.radians(task.max_incline))
+    stroke = slope * (robot.hip_x + robot.half_track)
+    room = min(highest - task.body_height, task.body_height - lowest)
+    if room <= 0:
+        raise ConfigError(
+            f"body_height is {task.body_height} m; the legs reach from {lowest:.3f} to "
+            f"{highest:.3f} m"
+        )
+    if stroke > room:
+        limit = math.degrees(math.atan(room / (robot.hip_x + robot.half_track)))
+        raise ConfigError(
+            f"max_incline is {task.max_incline} deg; on both axes at once it asks the legs for "
+            f"{stroke * 1000:.0f} mm, but from body_height {task.body_height} m they have "
+            f"{room * 1000:.0f} mm: at most {limit:.1f} deg"
+        )
+    if not dqn.hidden_sizes or min(dqn.hidden_sizes) < 1:
+        raise ConfigError(f"hidden_sizes is {dqn.hidden_sizes}; it must hold positive widths")
+    if config.num_envs is not None and dqn.replay_capacity < config.num_envs:
+        raise ConfigError(
+            f"replay_capacity is {dqn.replay_capacity}; it must hold at least one decision of "
+            f"all num_envs = {config.num_envs} envs"
+        )
+    if dqn.min_replay_size > dqn.replay_capacity:
+        raise ConfigError(
+            f"min_replay_size is {dqn.min_replay_size}; it must not exceed replay_capacity, "
+            f"{dqn.replay_capacity}"
+        )
+    return config
+
+
+_POSITIVE = frozenset(
+    "sim_dt ctrl_dt body_height max_incline board_rate target_period action_max height_scale "
+    "gyro_scale accel_scale reward_toward_scale episode_length learning_rate batch_size "
+    "updates_per_step replay_capacity min_replay_size target_update_period epsilon_decay_steps "
+    "max_grad_norm num_envs num_env_steps num_devices log_every checkpoint_every eval_scenarios "
+    "eval_duration foot_friction servo_stiffness hip_x hip_y thigh calf foot_radius".split()
+)
+_UNIT = frozenset(("action_ramp", "square_share", "gamma", "epsilon_start", "epsilon_end"))
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Returns a config section as plain JSON values."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(kind: type[T], values: Mapping[str, Any]) -> T:
+    """Rebuilds the config section `kind` from `to_dict`'s values.
+
+    Raises:
+      ConfigError: for a field that `kind` does not have.
+    """
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]
+    unknown = sorted(set(values) - set(fields))
+    if unknown:
+        raise ConfigError(f"unknown field {unknown[0]!r} in {kind.__name__}")
+    built = {}
+    for name, value in values.items():
+        section = _SECTIONS.get(name)
+        if section is not None:
+            value = from_dict(section, value)
+        elif isinstance(value, list):
+            value = tuple(value)
+        built[name] = value
+    return kind(**built)
+
+
+_SECTIONS = {"task": TaskConfig, "robot": RobotConfig, "dqn": DQNConfig}

@@ -1,0 +1,155 @@
+"""`BalanceEnv`: one robot on one board, a brax environment with 441 discrete actions."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+from mjx_balance import physics
+from mjx_balance.config import ACTION_AXES, Config, check, preset
+from mjx_balance.plant import decision_ctrl, observation, standing_heights
+from mjx_balance.scene import Scene, load_scene
+from mjx_balance.task import tilt
+from mjx_balance.task.actions import action_table, apply_action
+from mjx_balance.task.observation import extend_history, observation_names
+from mjx_balance.task.reward import failed, reward_terms
+
+
+class BalanceEnv(Env):
+    """A quadruped on a board that tilts in two axes (paper section 3).
+
+    One step is one decision: `sim_steps` physics steps of MJX. `done` is 1 after a
+    fall or at the time limit; `info["truncation"]` is 1 only at the time limit, so
+    that `done * (1 - truncation)` marks true terminations. A done env is not reset
+    by `step`: the observation it returns is the one before the reset.
+
+    Written for one board; `jax.vmap` it over thousands.
+    """
+
+    def __init__(self, config: Config | None = None):
+        """Builds the scene.
+
+        Args:
+          config: the preset "default" if none.
+
+        Raises:
+          ConfigError: if the config cannot be run.
+        """
+        self.config = check(config or preset("default"))
+        self.scene: Scene = load_scene(self.config)
+        self._table = action_table(self.config.task)
+
+    @functools.cached_property
+    def _advance(self) -> physics.Advance:
+        return physics.mjx_advance(self.scene)
+
+    @property
+    def observation_size(self) -> int:
+        return len(observation_names(self.config.task, self.config.robot))
+
+    @property
+    def action_size(self) -> int:
+        """Number of discrete actions."""
+        return self.config.task.num_actions
+
+    @property
+    def action_factors(self) -> tuple[int, ...]:
+        """The action index as a mixed-radix number: levels of roll, levels of pitch."""
+        return (self.config.task.action_levels,) * ACTION_AXES
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+    def reset(self, rng: jax.Array) -> State:
+        """Starts a fresh tilt scenario from the settled stance.
+
+        Args:
+          rng: PRNG key.
+
+        Returns:
+          State with obs (obs_size,).
+        """
+        task = self.config.task
+        state = physics.initial_state(self.scene)
+        still = jnp.asarray(self.scene.stance.imu, jnp.float32)
+        info = {
+            "scenario": self._scenario(rng),
+            "heights": jnp.asarray(standing_heights(self.config), jnp.float32),
+            "imu": jnp.tile(still, (task.history, 1)),
+            "tilt": jnp.float32(0.0),
+            "decision": jnp.int32(0),
+            "truncation": jnp.float32(0.0),
+        }
+        metrics = {
+            name: jnp.float32(0.0)
+            for name in ("tilt_deg", "fall", "reward_level", "reward_toward", "reward_fail")
+        }
+        obs = observation(self.config, self.scene, state.qpos, info["imu"])
+        zero = jnp.float32(0.0)
+        return State(state, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Takes one decision.
+
+        Args:
+          state: from `reset` or `step`.
+          action: () action index, 0 to action_size - 1.
+
+        Returns:
+          The state `ctrl_dt` later.
+        """
+        config, task, info = self.config, self.config.task, state.info
+        change = jnp.asarray(self._table)[action]
+        heights = apply_action(task, config.robot, info["heights"], change)
+        decision = info["decision"]
+        ctrl = decision_ctrl(
+            config, self.scene, info["scenario"], decision, info["heights"], heights
+        )
+        moved, motion = self._advance(state.pipeline_state, ctrl)  # pyright: ignore
+
+        fell = failed(task, motion.tilt).any()
+        truncated = ~fell & (decision + 1 >= task.episode_length)
+        # A diverged world has fallen; what is not a number must not reach the learner.
+        moved, motion = jax.tree.map(jnp.nan_to_num, (moved, motion))
+        after = motion.tilt[-1]
+        terms = reward_terms(task, info["tilt"], after, fell.astype(after.dtype))
+        imu = extend_history(info["imu"], motion.imu)
+        metrics = {
+            "tilt_deg": motion.tilt.mean(),
+            "fall": fell.astype(jnp.float32),
+            **{f"reward_{name}": term for name, term in terms.items()},
+        }
+        info = info | {
+            "heights": heights,
+            "imu": imu,
+            "tilt": after,
+            "decision": decision + 1,
+            "truncation": truncated.astype(jnp.float32),
+        }
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            pipeline_state=moved,
+            obs=observation(config, self.scene, moved.qpos, imu),
+            reward=sum(terms.values()),
+            done=(fell | truncated).astype(jnp.float32),
+            metrics=state.metrics | metrics,
+            info=info,
+        )
+
+    def _scenario(self, key: jax.Array) -> tilt.Scenario:
+        """Draws the targets, and the age of the first.
+
+        The random phase keeps thousands of boards from turning at the same time.
+        """
+        task = self.config.task
+        count = tilt.num_targets(task, task.episode_length * task.ctrl_dt)
+        key_disc, key_square, key_which, key_phase = jax.random.split(key, 4)
+        disc = tilt.disc_targets(task, *jax.random.uniform(key_disc, (2, count)))
+        limit = task.max_incline
+        square = jax.random.uniform(key_square, (count, 2), minval=-limit, maxval=limit)
+        in_square = jax.random.bernoulli(key_which, task.square_share, (count, 1))
+        targets = jnp.where(in_square, square, disc)
+        # The board starts level, so the first target is one it has already reached.
+        targets = targets.at[0].set(0.0)
+        return tilt.Scenario(targets, jax.random.uniform(key_phase) * task.target_period)

@@ -1,0 +1,206 @@
+"""The exported policy: a self-describing safetensors file and its NumPy forward pass.
+
+Nothing here needs JAX. The file holds float32 weights and, in its metadata, a JSON
+manifest with everything a user needs to run the policy elsewhere: config,
+observation layout and scaling, action table, rates, scene fingerprint, versions
+and where the training came from.
+"""
+
+import importlib.metadata
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from mjx_balance.config import Config, ConfigError, check, from_dict, to_dict
+from mjx_balance.task.actions import action_table
+from mjx_balance.task.observation import observation_names, observation_scale
+
+FORMAT = "mjx_balance.policy"
+FORMAT_VERSION = 1
+VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
+
+
+class PolicyError(ValueError):
+    """A policy file that cannot be used; the message says what is wrong with it."""
+
+
+class Policy:
+    """A greedy policy in NumPy.
+
+    Calling it maps observations to action indices. `.manifest` is the file's JSON,
+    `.config` the config it was trained with, `.actions` the (num_actions, 2) height
+    changes in m that the indices stand for.
+    """
+
+    def __init__(self, manifest: dict[str, Any], weights: Mapping[str, np.ndarray]):
+        """Takes what a policy file holds.
+
+        Raises:
+          PolicyError: if manifest and weights do not fit together.
+        """
+        if manifest.get("format") != FORMAT:
+            raise PolicyError(f"format is {manifest.get('format')!r}; it must be {FORMAT!r}")
+        if manifest.get("version") != FORMAT_VERSION:
+            raise PolicyError(
+                f"format version is {manifest.get('version')!r}; this release reads "
+                f"version {FORMAT_VERSION}"
+            )
+        try:
+            self.config = check(from_dict(Config, manifest["config"]))
+            network = manifest["network"]
+            self.factors = tuple(int(n) for n in network["factors"])
+            hidden_sizes = tuple(int(n) for n in network["hidden_sizes"])
+            self.actions = np.asarray(manifest["actions"]["table_m"], np.float32)
+            obs_size = len(manifest["observation"]["names"])
+            self.scene_hash = str(manifest["scene_hash"])
+        except (KeyError, TypeError, ConfigError) as error:
+            raise PolicyError(f"its manifest cannot be used: {error}") from error
+        if self.actions.shape != (math.prod(self.factors), 2):
+            raise PolicyError(
+                f"its action table has shape {self.actions.shape}; its network chooses among "
+                f"{math.prod(self.factors)} actions"
+            )
+        self.manifest = manifest
+        self.observation_size = obs_size
+        names = [f"hidden_{i}" for i in range(len(hidden_sizes))] + ["head"]
+        sizes = (obs_size, *hidden_sizes, sum(self.factors))
+        self._layers = []
+        for name, rows, columns in zip(names, sizes[:-1], sizes[1:], strict=True):
+            kernel = _weight(weights, f"{name}/kernel", (rows, columns))
+            self._layers.append((kernel, _weight(weights, f"{name}/bias", (columns,))))
+
+    def q_values(self, obs: np.ndarray) -> np.ndarray:
+        """Action values.
+
+        Args:
+          obs: (obs_size,) or (batch, obs_size) scaled observations.
+
+        Returns:
+          (num_actions,) or (batch, num_actions) float32.
+
+        Raises:
+          ValueError: if obs has another size.
+        """
+        x = np.asarray(obs, np.float32)
+        if x.ndim not in (1, 2) or x.shape[-1] != self.observation_size:
+            raise ValueError(
+                f"obs has shape {x.shape}; it must be ({self.observation_size},) or "
+                f"(batch, {self.observation_size})"
+            )
+        for kernel, bias in self._layers[:-1]:
+            x = np.maximum(x @ kernel + bias, 0.0)
+        kernel, bias = self._layers[-1]
+        branches = np.split(x @ kernel + bias, np.cumsum(self.factors)[:-1], axis=-1)
+        values = branches[0]
+        for branch in branches[1:]:
+            values = values[..., :, None] + branch[..., None, :]
+            values = values.reshape(*values.shape[:-2], -1)
+        return values
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        """Index of the best action: () for (obs_size,), (batch,) for (batch, obs_size)."""
+        return np.argmax(self.q_values(obs), axis=-1)
+
+
+def _weight(weights: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    if name not in weights:
+        raise PolicyError(f"weight {name} is missing")
+    value = weights[name]
+    if value.shape != shape:
+        raise PolicyError(f"weight {name} has shape {value.shape}; it must be {shape}")
+    if not np.isfinite(value).all():
+        raise PolicyError(f"weight {name} holds values that are not finite numbers")
+    return value.astype(np.float32)
+
+
+def make_manifest(
+    config: Config, scene_hash: str, factors: tuple[int, ...], training: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Describes a policy.
+
+    Args:
+      config: what it was trained with.
+      scene_hash: fingerprint of the scene it was trained in.
+      factors: sizes of the network's action branches.
+      training: provenance, e.g. decisions and seconds.
+    """
+    task = config.task
+    versions = {}
+    for package in VERSIONED:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "config": to_dict(config),
+        "network": {"hidden_sizes": list(config.dqn.hidden_sizes), "factors": list(factors)},
+        "observation": {
+            "names": list(observation_names(task, config.robot)),
+            "scale": observation_scale(task, config.robot).tolist(),
+            "height_offset_m": task.body_height,
+            "imu_lag_s": task.sim_dt,
+        },
+        "actions": {
+            "table_m": action_table(task).tolist(),
+            "ramp_s": task.ramp_steps * task.sim_dt,
+        },
+        "rates_hz": {"decision": 1 / task.ctrl_dt, "imu": 1 / task.sim_dt},
+        "scene_hash": scene_hash,
+        "versions": versions,
+        "training": dict(training),
+    }
+
+
+def save_policy(
+    path: str | os.PathLike[str], params: Mapping[str, Any], manifest: dict[str, Any]
+) -> Policy:
+    """Writes a policy file, whole or not at all.
+
+    Args:
+      path: where to.
+      params: the flax network's variables, {"params": {layer: {kernel, bias}}}.
+      manifest: from `make_manifest`.
+
+    Returns:
+      The policy as it will be loaded.
+    """
+    weights = {
+        f"{layer}/{name}": np.ascontiguousarray(value, np.float32)
+        for layer, arrays in params["params"].items()
+        for name, value in arrays.items()
+    }
+    policy = Policy(manifest, weights)
+    part = Path(path).with_suffix(".part")
+    safetensors.numpy.save_file(weights, part, metadata={"manifest": json.dumps(manifest)})
+    part.replace(path)
+    return policy
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Reads a policy file.
+
+    Raises:
+      PolicyError: if it is missing, truncated, or not a policy this release can run.
+    """
+    if not Path(path).is_file():
+        raise PolicyError(f"no policy file at {path}; `mjx-balance train` writes one")
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if "manifest" not in metadata:
+            raise PolicyError("it carries no manifest, so it is no policy of mjx_balance")
+        return Policy(json.loads(metadata["manifest"]), weights)
+    except (safetensors.SafetensorError, json.JSONDecodeError) as error:
+        raise PolicyError(f"{path} is damaged or no safetensors file: {error}") from error
+    except PolicyError as error:
+        raise PolicyError(f"{path} cannot be used: {error}") from error

@@ -1,0 +1,228 @@
+"""Builds the MuJoCo model from `scenes/*.xml` and the config; finds the standing state."""
+
+import dataclasses
+import hashlib
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from mjx_balance.config import Config, ConfigError, RobotConfig
+from mjx_balance.task.legs import joint_angles
+
+VISUAL_GROUP = 2
+ROBOT, BOARD = "robot/", "board/"
+LEG_JOINTS = ("abduction", "hip", "knee")
+CONTACT_TIME = 0.01
+"""Time constant of the foot contacts, s: near the shortest that 4 ms steps carry."""
+SETTLE_STEPS = 750
+SETTLE_ROUNDS = 4
+
+
+def scene_dir() -> Path:
+    """Folder of the MJCF files: in the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "scenes"
+    return installed if installed.is_dir() else package.parent / "scenes"
+
+
+@dataclasses.dataclass(frozen=True)
+class Stance:
+    """The settled standing state, the start of every episode."""
+
+    qpos: np.ndarray
+    """(nq,)"""
+    qvel: np.ndarray
+    """(nv,)"""
+    qacc_warmstart: np.ndarray
+    """(nv,)"""
+    leg_trim: np.ndarray
+    """(legs, 3) rad added to the joint angles, so that the loaded servos stand where
+    they are told: the robot's own weight would otherwise bend the legs by millimetres."""
+    imu: np.ndarray
+    """(6,) gyro in rad/s and accelerometer in m/s^2 at rest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A compiled model and the addresses everything else needs, looked up once by name."""
+
+    model: mujoco.MjModel
+    leg_qpos: np.ndarray
+    """(legs, 3) addresses of the leg joints in qpos."""
+    leg_ctrl: np.ndarray
+    """(legs, 3) addresses of the leg servos in ctrl."""
+    board_qpos: np.ndarray
+    """(2,) addresses of the board hinges, X and Y, in qpos."""
+    board_ctrl: np.ndarray
+    """(2,) addresses of the board servos in ctrl."""
+    trunk_quat: np.ndarray
+    """(4,) addresses of the trunk's orientation in qpos."""
+    imu: np.ndarray
+    """(6,) addresses of gyro and accelerometer in sensordata."""
+    stance: Stance
+
+    @property
+    def hash(self) -> str:
+        """Fingerprint of the physics: equal for equal dynamics, whatever the looks."""
+        return scene_hash(self.model)
+
+
+def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
+    """Assembles and compiles stage, board and robot.
+
+    Args:
+      config: gives the time step, the standing height and the foot friction.
+      visual: whether to keep the geoms that are only looked at; without them
+        MJX has a sixth of the geoms to move.
+    """
+    stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
+    board = mujoco.MjSpec.from_file(str(scene_dir() / "board.xml"))
+    robot = mujoco.MjSpec.from_file(str(scene_dir() / "quadruped.xml"))
+    height = config.task.body_height
+    stage.attach(board, prefix=BOARD, frame=stage.worldbody.add_frame())
+    stage.attach(robot, prefix=ROBOT, frame=stage.worldbody.add_frame(pos=[0, 0, height]))
+    friction = config.robot.foot_friction
+    for leg in config.robot.legs:
+        stage.add_pair(
+            name=f"{leg}_contact",
+            geomname1=f"{ROBOT}{leg}_foot",
+            geomname2=f"{BOARD}board",
+            condim=3,
+            friction=[friction, friction, 0.005, 0.0001, 0.0001],
+            solref=[CONTACT_TIME, 1],
+        )
+    stage.option.timestep = config.task.sim_dt
+    if not visual:
+        for geom in [g for g in stage.geoms if g.group == VISUAL_GROUP]:
+            stage.delete(geom)
+    model = stage.compile()
+    for name, modelled in robot_numbers(config.robot, model).items():
+        value = getattr(config.robot, name)
+        if not math.isclose(modelled, value, rel_tol=1e-3):
+            raise ConfigError(
+                f"{name} is {value}, but the robot in quadruped.xml has {modelled:g}; "
+                "change both or neither"
+            )
+    return model
+
+
+def robot_numbers(robot: RobotConfig, model: mujoco.MjModel) -> dict[str, float]:
+    """Reads the fields of `RobotConfig` back from the compiled model, in their units."""
+    leg = robot.legs[0]
+    hip, thigh, calf = (model.body(f"{ROBOT}{leg}_{part}") for part in ("hip", "thigh", "calf"))
+    foot = model.geom(f"{ROBOT}{leg}_foot")
+    trunk = model.body(f"{ROBOT}trunk")
+    knee_joint, knee_servo = model.joint(f"{ROBOT}{leg}_knee"), model.actuator(f"{ROBOT}{leg}_knee")
+    hip_servo = model.actuator(f"{ROBOT}{leg}_hip")
+    return {
+        "hip_x": hip.pos[0],
+        "hip_y": hip.pos[1],
+        "abduction_offset": thigh.pos[1],
+        "thigh": -calf.pos[2],
+        "calf": -foot.pos[2],
+        "foot_radius": foot.size[0],
+        "trunk_mass": trunk.mass[0],
+        "total_mass": trunk.subtreemass[0],
+        "knee_min": knee_joint.range[0],
+        "knee_max": knee_joint.range[1],
+        "hip_torque": hip_servo.forcerange[1],
+        "knee_torque": knee_servo.forcerange[1],
+        "servo_stiffness": knee_servo.gainprm[0],
+        "servo_damping": np.ravel(knee_joint.damping)[0],
+    }
+
+
+def load_scene(config: Config, visual: bool = False) -> Scene:
+    """Builds the model, looks its addresses up and settles the robot.
+
+    Raises:
+      ConfigError: if the robot does not come to rest upright.
+    """
+    model = build_model(config, visual)
+    names = [[f"{ROBOT}{leg}_{joint}" for joint in LEG_JOINTS] for leg in config.robot.legs]
+    leg_qpos = np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names])
+    leg_ctrl = np.asarray([[model.actuator(n).id for n in leg] for leg in names])
+    board = [f"{BOARD}board_{axis}" for axis in "xy"]
+    root = model.joint(f"{ROBOT}root").qposadr[0]
+    sensors = [model.sensor(f"{ROBOT}{name}") for name in ("gyro", "accelerometer")]
+    imu = np.concatenate([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in sensors])
+    return Scene(
+        model=model,
+        leg_qpos=leg_qpos,
+        leg_ctrl=leg_ctrl,
+        board_qpos=np.asarray([model.joint(n).qposadr[0] for n in board]),
+        board_ctrl=np.asarray([model.actuator(n).id for n in board]),
+        trunk_quat=np.arange(root + 3, root + 7),
+        imu=imu,
+        stance=settle(config, model, leg_qpos, leg_ctrl, root, imu),
+    )
+
+
+def settle(
+    config: Config,
+    model: mujoco.MjModel,
+    leg_qpos: np.ndarray,
+    leg_ctrl: np.ndarray,
+    root: int,
+    imu: np.ndarray,
+) -> Stance:
+    """Lets the robot come to rest on the level board, joints where they were told to be.
+
+    A position servo under load stands off its target. Each round adds that error
+    to the trim, as the integral term of a servo would.
+    """
+    task = config.task
+    wanted = joint_angles(config.robot, np.full(len(config.robot.legs), task.body_height))
+    trim = np.zeros_like(wanted)
+    data = mujoco.MjData(model)
+    data.qpos[root : root + 7] = (0, 0, task.body_height, 1, 0, 0, 0)
+    data.qpos[leg_qpos] = wanted
+    for _ in range(SETTLE_ROUNDS):
+        data.ctrl[leg_ctrl] = wanted + trim
+        mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
+        trim = trim + wanted - data.qpos[leg_qpos]
+    data.ctrl[leg_ctrl] = wanted + trim
+    data.qpos[root : root + 2] = 0
+    mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
+    upright = np.abs(data.qpos[root + 4 : root + 6]).max() < 0.01
+    if not (upright and np.abs(data.qvel).max() < 0.01):
+        raise ConfigError(
+            f"the robot does not stand still at body_height {task.body_height} m with "
+            f"servo_stiffness {config.robot.servo_stiffness} N m/rad; try values nearer the defaults"
+        )
+    return Stance(
+        qpos=data.qpos.copy(),
+        qvel=data.qvel.copy(),
+        qacc_warmstart=data.qacc_warmstart.copy(),
+        leg_trim=trim,
+        imu=data.sensordata[imu].copy(),
+    )
+
+
+_HASHED = (
+    "body_mass body_inertia body_ipos body_iquat body_pos body_quat jnt_type jnt_axis jnt_pos "
+    "jnt_range dof_armature dof_damping dof_frictionloss actuator_gainprm actuator_biasprm "
+    "actuator_forcerange site_pos site_quat pair_friction pair_solref pair_solimp pair_margin "
+    "sensor_type"
+).split()
+
+
+def scene_hash(model: mujoco.MjModel) -> str:
+    """Hashes what the dynamics depend on, to six significant digits.
+
+    Args:
+      model: with or without its visual geoms; both give the same hash.
+
+    Returns:
+      16 hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    collides = np.isin(np.arange(model.ngeom), np.r_[model.pair_geom1, model.pair_geom2])
+    parts = [getattr(model, name) for name in _HASHED]
+    parts += [model.geom_size[collides], model.geom_pos[collides], model.geom_quat[collides]]
+    parts += [np.asarray([model.opt.timestep, *model.opt.gravity, model.opt.integrator])]
+    for part in parts:
+        digest.update(",".join(f"{x:.6g}" for x in np.ravel(part)).encode() + b";")
+    return digest.hexdigest()[:16]

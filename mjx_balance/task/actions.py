@@ -1,0 +1,51 @@
+"""The 21 x 21 actions of paper Eq. 3."""
+
+import numpy as np
+
+from mjx_balance.config import RobotConfig, TaskConfig
+from mjx_balance.task import Array
+
+
+def action_table(task: TaskConfig) -> np.ndarray:
+    """Height changes of every action: a_x varies slowest.
+
+    Returns:
+      (action_levels**2, 2) a_x and a_y, m, float32.
+    """
+    n = np.arange(task.action_levels)
+    level = -task.action_max + 2 * task.action_max * n / (task.action_levels - 1)
+    a_x, a_y = np.meshgrid(level, level, indexing="ij")
+    return np.stack((a_x.ravel(), a_y.ravel()), axis=-1).astype(np.float32)
+
+
+def leg_signs(robot: RobotConfig) -> np.ndarray:
+    """Which way each foot goes: left +a_x, right -a_x, front +a_y, hind -a_y.
+
+    Returns:
+      (2, legs) of +-1, float32.
+    """
+    left = [1.0 if name[0] == "L" else -1.0 for name in robot.legs]
+    front = [1.0 if name[1] == "F" else -1.0 for name in robot.legs]
+    return np.asarray((left, front), np.float32)
+
+
+def apply_action(task: TaskConfig, robot: RobotConfig, heights: Array, change: Array) -> Array:
+    """Adds one action to the foot heights.
+
+    Raising the left side by a_x means longer left legs and shorter right ones.
+    The heights stay within the legs' reach.
+
+    Args:
+      task: names the units.
+      robot: leg names and reach.
+      heights: (..., legs) commanded foot heights, m.
+      change: (..., 2) a_x and a_y, m.
+
+    Returns:
+      (..., legs) commanded foot heights, m.
+    """
+    xp = heights.__array_namespace__()
+    signs = leg_signs(robot).astype(heights.dtype)
+    moved = heights + change[..., :1] * signs[0] + change[..., 1:] * signs[1]
+    lowest, highest = robot.height_range
+    return xp.clip(moved, lowest, highest)

@@ -1,0 +1,59 @@
+"""The observation of paper Eq. 2: four foot heights and lagged raw IMU samples."""
+
+import numpy as np
+
+from mjx_balance.config import RobotConfig, TaskConfig
+from mjx_balance.task import Array
+
+IMU_CHANNELS = 6
+"""Gyro x, y, z in rad/s, then accelerometer x, y, z in m/s^2."""
+
+
+def observation_names(task: TaskConfig, robot: RobotConfig) -> tuple[str, ...]:
+    """Name of every observation entry, in order, e.g. `H_LF`, `V_x,t-2`, `Acc_y,t-15`."""
+    names = [f"H_{leg}" for leg in robot.legs]
+    for symbol, lags in (("V", task.gyro_lags), ("Acc", task.accel_lags)):
+        names += [f"{symbol}_{axis},t-{lag}" for axis in "xy" for lag in lags]
+    return tuple(names)
+
+
+def observation_scale(task: TaskConfig, robot: RobotConfig) -> np.ndarray:
+    """(obs_size,) physical size of a network input of 1: m, rad/s and m/s^2."""
+    return np.asarray(
+        [task.height_scale] * len(robot.legs)
+        + [task.gyro_scale] * 2 * len(task.gyro_lags)
+        + [task.accel_scale] * 2 * len(task.accel_lags),
+        np.float32,
+    )
+
+
+def observe(task: TaskConfig, robot: RobotConfig, heights: Array, imu: Array) -> Array:
+    """Builds the scaled observation.
+
+    Args:
+      task: lags and scales.
+      robot: leg order.
+      heights: (..., legs) measured foot heights, m.
+      imu: (..., task.history, 6) latest IMU samples, the newest last.
+
+    Returns:
+      (..., obs_size) in the order of `observation_names`.
+    """
+    xp = imu.__array_namespace__()
+    newest = imu.shape[-2] - 1
+    gyro = imu[..., newest - np.asarray(task.gyro_lags), :]
+    accel = imu[..., newest - np.asarray(task.accel_lags), :]
+    parts = (
+        heights - task.body_height,
+        gyro[..., 0],
+        gyro[..., 1],
+        accel[..., 3],
+        accel[..., 4],
+    )
+    return xp.concatenate(parts, axis=-1) / observation_scale(task, robot).astype(imu.dtype)
+
+
+def extend_history(history: Array, samples: Array) -> Array:
+    """Appends (..., m, 6) samples to a (..., h, 6) history and keeps the last h."""
+    xp = history.__array_namespace__()
+    return xp.concatenate((history, samples), axis=-2)[..., -history.shape[-2] :, :]

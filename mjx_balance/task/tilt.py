@@ -1,0 +1,73 @@
+"""Board tilt: a scenario is a value, and the board's angle a closed form of it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_balance.config import TaskConfig
+from mjx_balance.task import Array
+
+
+class Scenario(NamedTuple):
+    """Where the board is told to go (paper 3.1).
+
+    The board starts level. It takes aim at `targets[k]` at time
+    `k * target_period - phase` and stays there once it has arrived.
+    """
+
+    targets: Array
+    """(..., n, 2) board angles about X and Y, deg."""
+    phase: Array
+    """(...) time the first target is already old at time 0, s."""
+
+
+def num_targets(task: TaskConfig, duration: float) -> int:
+    """Targets that a scenario of `duration` seconds needs, whatever its phase."""
+    return int(np.ceil(duration / task.target_period)) + 1
+
+
+def board_angle(task: TaskConfig, scenario: Scenario, time: Array) -> Array:
+    """Commanded board angle.
+
+    Each axis moves at `board_rate` from the last target to the next and then
+    rests; config checks that it always arrives within the period, so the angle
+    is a closed form of the time.
+
+    Args:
+      task: rates and period.
+      scenario: one scenario, targets (n, 2), or a batch.
+      time: (..., m) s since the start, not negative; past the last target the
+        board rests there.
+
+    Returns:
+      (..., m, 2) deg.
+    """
+    targets, phase = scenario
+    xp = targets.__array_namespace__()
+    clock = time + phase[..., None]
+    last = targets.shape[-2] - 1
+    period = xp.clip(xp.floor(clock / task.target_period), 0, last).astype(int)
+    since = clock - period * task.target_period
+    level = xp.zeros_like(targets[..., :1, :])
+    stops = xp.concatenate((level, targets), axis=-2)
+    start = xp.take_along_axis(stops, period[..., None], axis=-2)
+    change = xp.take_along_axis(targets, period[..., None], axis=-2) - start
+    reach = (task.board_rate * since)[..., None]
+    return start + xp.clip(change, -reach, reach)
+
+
+def disc_targets(task: TaskConfig, direction: Array, magnitude: Array) -> Array:
+    """Targets of suite `paper`: direction and total tilt drawn from [0, 1).
+
+    Args:
+      task: gives the greatest incline.
+      direction: (...) share of a full turn.
+      magnitude: (...) share of the greatest incline.
+
+    Returns:
+      (..., 2) deg about X and Y.
+    """
+    xp = direction.__array_namespace__()
+    angle = 2 * np.pi * direction
+    unit = xp.stack((xp.cos(angle), xp.sin(angle)), axis=-1)
+    return task.max_incline * magnitude[..., None] * unit
