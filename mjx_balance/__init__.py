@@ -7,6 +7,7 @@ where JAX is not installed.
 from typing import TYPE_CHECKING
 
 from mjx_balance.policy import load_policy
+from mjx_balance.quiet import quiet_imports
 
 if TYPE_CHECKING:
     from mjx_balance.env import BalanceEnv
@@ -16,7 +17,8 @@ __all__ = ["BalanceEnv", "load_policy"]
 
 def __getattr__(name: str) -> object:
     if name == "BalanceEnv":
-        from mjx_balance.env import BalanceEnv
+        with quiet_imports():
+            from mjx_balance.env import BalanceEnv
 
         return BalanceEnv
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,6 +9,7 @@ dimensions, "chosen" a number the paper does not give.
 """
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
@@ -16,6 +17,8 @@ from typing import Any, Literal, TypeVar
 T = TypeVar("T")
 
 ACTION_AXES = 2  # roll and pitch, paper Eq. 3
+LEGS = ("LF", "RF", "LH", "RH")
+HEADS = ("joint", "factored")
 
 
 class ConfigError(ValueError):
@@ -26,7 +29,7 @@ class ConfigError(ValueError):
 class RobotConfig:
     """Dimensions of `scenes/quadruped.xml`, compared with the compiled model by a test."""
 
-    legs: tuple[str, ...] = ("LF", "RF", "LH", "RH")
+    legs: tuple[str, ...] = LEGS
     """Leg prefixes in observation order (paper Eq. 2)."""
     hip_x: float = 0.193
     """Fore-aft distance of the hips from the trunk centre, m (Go2)."""
@@ -117,7 +120,7 @@ class TaskConfig:
     """Reward for a level body (paper Eq. 4)."""
     reward_sharpness: float = 1.5
     """Decay of that reward with the body tilt, 1/deg (paper Eq. 4)."""
-    reward_toward: float = 0.2
+    reward_toward: float = 0.4
     """Greatest reward for moving toward the horizontal (paper Fig. 5; height chosen)."""
     reward_toward_scale: float = 1.0
     """Change of tilt that earns it, deg (paper Fig. 5; scale chosen)."""
@@ -197,11 +200,11 @@ class Config:
     """Decisions of the run, over all boards (paper 4: about 200k)."""
     num_devices: int | None = None
     """JAX devices to spread the boards over; none: one per CPU core, or all accelerators."""
-    log_every: int = 4_096
+    log_every: int = 2_048
     """Env steps between two lines of metrics."""
     checkpoint_every: int = 100_000
     """Env steps between two checkpoints."""
-    eval_scenarios: int = 256
+    eval_scenarios: int = 128
     """Scenarios per suite of the evaluation after training."""
     eval_duration: float = 60.0
     """Length of each of them, s."""
@@ -260,16 +263,26 @@ def check(config: Config) -> Config:
             value = getattr(section, field.name)
             if isinstance(value, float) and not math.isfinite(value):
                 raise ConfigError(f"{field.name} is {value}; it must be a finite number")
+            if type(field.default) is int and type(value) is not int:
+                raise ConfigError(f"{field.name} is {value!r}; it must be a whole number")
+            if field.name in _NOT_NEGATIVE and value < 0:
+                raise ConfigError(f"{field.name} is {value}; it must not be negative")
             if field.name in _POSITIVE and value is not None and not value > 0:
                 raise ConfigError(f"{field.name} is {value}; it must be greater than 0")
             if field.name in _UNIT and not 0 <= value <= 1:
                 raise ConfigError(f"{field.name} is {value}; it must lie between 0 and 1")
+    if config.preset not in PRESETS:
+        preset(config.preset)
+    if sorted(robot.legs) != sorted(LEGS):
+        raise ConfigError(f"legs is {robot.legs}; it must name each of {', '.join(LEGS)} once")
+    if dqn.head not in HEADS:
+        raise ConfigError(f"head is {dqn.head!r}; it must be one of {', '.join(HEADS)}")
     steps = task.ctrl_dt / task.sim_dt
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
         raise ConfigError(
             f"ctrl_dt is {task.ctrl_dt} s; it must be a whole multiple of sim_dt, {task.sim_dt} s"
         )
-    if not 0 < task.action_ramp:
+    if not task.action_ramp > 0:
         raise ConfigError(f"action_ramp is {task.action_ramp}; it must be greater than 0")
     if task.action_levels < 3 or task.action_levels % 2 == 0:
         raise ConfigError(
@@ -328,12 +341,13 @@ _POSITIVE = frozenset(
     "max_grad_norm num_envs num_env_steps num_devices log_every checkpoint_every eval_scenarios "
     "eval_duration foot_friction servo_stiffness hip_x hip_y thigh calf foot_radius".split()
 )
+_NOT_NEGATIVE = frozenset(("seed", "learning_rate_end", "reward_sharpness"))
 _UNIT = frozenset(("action_ramp", "square_share", "gamma", "epsilon_start", "epsilon_end"))
 
 
 def to_dict(config: Any) -> dict[str, Any]:
     """Returns a config section as plain JSON values."""
-    return dataclasses.asdict(config)
+    return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
 def from_dict(kind: type[T], values: Mapping[str, Any]) -> T:

@@ -5,20 +5,16 @@ state holds only what a physics step reads, so that it is cheap to carry, to res
 and to save, and so that the environment need not know the engine behind it.
 """
 
-import contextlib
 import copy
-import io
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from mujoco import mjx
 
 from mjx_balance.scene import Scene
 from mjx_balance.task.reward import body_tilt
-
-with contextlib.redirect_stdout(io.StringIO()):  # it prints when its Warp backend is absent
-    from mujoco import mjx
 
 SOLVER_ITERATIONS = 4
 """Newton iterations in training. A batch waits for its slowest world, but fewer do not

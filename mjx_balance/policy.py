@@ -18,7 +18,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from mjx_balance.config import Config, ConfigError, check, from_dict, to_dict
+from mjx_balance.config import Config, check, from_dict, to_dict
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
 
@@ -45,6 +45,8 @@ class Policy:
         Raises:
           PolicyError: if manifest and weights do not fit together.
         """
+        if not isinstance(manifest, dict):
+            raise PolicyError("its manifest is not a JSON object")
         if manifest.get("format") != FORMAT:
             raise PolicyError(f"format is {manifest.get('format')!r}; it must be {FORMAT!r}")
         if manifest.get("version") != FORMAT_VERSION:
@@ -60,13 +62,24 @@ class Policy:
             self.actions = np.asarray(manifest["actions"]["table_m"], np.float32)
             obs_size = len(manifest["observation"]["names"])
             self.scene_hash = str(manifest["scene_hash"])
-        except (KeyError, TypeError, ConfigError) as error:
+            scale = np.asarray(manifest["observation"]["scale"], np.float32)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise PolicyError(f"its manifest cannot be used: {error}") from error
+        task, robot = self.config.task, self.config.robot
         if self.actions.shape != (math.prod(self.factors), 2):
             raise PolicyError(
                 f"its action table has shape {self.actions.shape}; its network chooses among "
                 f"{math.prod(self.factors)} actions"
             )
+        agrees = {
+            "action table": np.array_equal(self.actions, action_table(task)),
+            "observation names": tuple(manifest["observation"]["names"])
+            == observation_names(task, robot),
+            "observation scale": np.array_equal(scale, observation_scale(task, robot)),
+        }
+        for name, same in agrees.items():
+            if not same:
+                raise PolicyError(f"its {name} is not the one that its own config gives")
         self.manifest = manifest
         self.observation_size = obs_size
         names = [f"hidden_{i}" for i in range(len(hidden_sizes))] + ["head"]

@@ -190,7 +190,7 @@ def settle(
     if not (upright and np.abs(data.qvel).max() < 0.01):
         raise ConfigError(
             f"the robot does not stand still at body_height {task.body_height} m with "
-            f"servo_stiffness {config.robot.servo_stiffness} N m/rad; try values nearer the defaults"
+            f"servo_stiffness {config.robot.servo_stiffness} N m/rad; try the defaults"
         )
     return Stance(
         qpos=data.qpos.copy(),
@@ -202,10 +202,12 @@ def settle(
 
 
 _HASHED = (
-    "body_mass body_inertia body_ipos body_iquat body_pos body_quat jnt_type jnt_axis jnt_pos "
-    "jnt_range dof_armature dof_damping dof_frictionloss actuator_gainprm actuator_biasprm "
-    "actuator_forcerange site_pos site_quat pair_friction pair_solref pair_solimp pair_margin "
-    "sensor_type"
+    "body_mass body_inertia body_ipos body_iquat body_pos body_quat jnt_type jnt_axis "
+    "jnt_pos jnt_range jnt_limited jnt_solref jnt_stiffness qpos0 dof_armature "
+    "dof_damping dof_frictionloss actuator_gainprm actuator_biasprm actuator_forcerange "
+    "actuator_ctrlrange actuator_gear site_pos site_quat pair_friction pair_solref "
+    "pair_solimp pair_margin pair_gap pair_dim pair_solreffriction sensor_type "
+    "sensor_objid"
 ).split()
 
 
@@ -222,7 +224,9 @@ def scene_hash(model: mujoco.MjModel) -> str:
     collides = np.isin(np.arange(model.ngeom), np.r_[model.pair_geom1, model.pair_geom2])
     parts = [getattr(model, name) for name in _HASHED]
     parts += [model.geom_size[collides], model.geom_pos[collides], model.geom_quat[collides]]
-    parts += [np.asarray([model.opt.timestep, *model.opt.gravity, model.opt.integrator])]
+    option = model.opt
+    parts += [option.timestep, option.gravity, option.integrator]
+    parts += [option.cone, option.impratio, option.disableflags]
     for part in parts:
         digest.update(",".join(f"{x:.6g}" for x in np.ravel(part)).encode() + b";")
     return digest.hexdigest()[:16]

@@ -189,7 +189,9 @@ class Learner:
             key=key,
         )
         # The cosine runs over the updates of a whole run; none is made before the warm-up.
-        ready = state.replay.size * self.num_devices >= self.config.min_replay_size
+        capacity = state.replay.data.action.shape[0]
+        wanted = min(self.config.min_replay_size // self.num_devices, capacity)
+        ready = state.replay.size >= wanted
         keys = jax.random.split(self._device_key(key_learn), self.config.updates_per_step)
         state, losses = jax.lax.cond(
             ready,
@@ -218,14 +220,18 @@ class Learner:
             next_obs=after.obs,  # pyright: ignore[reportArgumentType]
         )
         metrics = jax.tree.map(jnp.mean, after.metrics | {"reward": after.reward})
-        fresh = self._reset(self._device_key(key_reset), count)
-        done = after.done.astype(bool)
+        env_state = self.reset_done(after, self._device_key(key_reset))
+        return env_state, transition, jax.lax.pmean(metrics, AXIS)
+
+    def reset_done(self, state: State, key: jax.Array) -> State:
+        """Replaces those of the batched env states that are done by fresh ones."""
+        fresh = self._reset(key, state.reward.shape[0])
+        done = state.done.astype(bool)
 
         def choose(new: jax.Array, old: jax.Array) -> jax.Array:
             return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
-        env_state = jax.tree.map(choose, fresh, after)
-        return env_state, transition, jax.lax.pmean(metrics, AXIS)
+        return jax.tree.map(choose, fresh, state)
 
     def _update(self, state: TrainState, key: jax.Array) -> tuple[TrainState, jax.Array]:
         """One gradient step on a batch of which each device samples its share."""

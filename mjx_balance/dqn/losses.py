@@ -31,7 +31,7 @@ def td_error(
       ValueError: if given a batch.
     """
     ranks = [x.ndim for x in (q_tm1, a_tm1, r_t, discount_t, q_t)]
-    if ranks != [1, 0, 0, 0, 1]:
+    if ranks != [1, 0, 0, 0, 1] or (q_t_selector is not None and q_t_selector.ndim != 1):
         raise ValueError(f"td_error takes one transition, ranks [1, 0, 0, 0, 1]; got {ranks}")
     best = q_t.max() if q_t_selector is None else q_t[jnp.argmax(q_t_selector)]
     return jax.lax.stop_gradient(r_t + discount_t * best) - q_tm1[a_tm1]

@@ -1,0 +1,214 @@
+"""How fast is the simulation, and what does learning cost on top?
+
+Measures, on whatever device JAX finds and interleaved in the same run:
+  mjx env    the raw environment in MJX, random actions, robots on their feet;
+  training   the whole training program of a preset, its own number of updates;
+  mujoco     `mujoco.batch.Batch`, MuJoCo's C engine on all cores, same model and
+             actions of the same kind: the peer that the ratios are against.
+Each row runs in a process of its own. Compile time and peak memory stand apart.
+
+    python benchmarks/throughput.py [--num-envs 64 256 1024] [--preset default] [--json FILE]
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+DECISIONS_PER_CALL = 2048
+
+
+def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
+    """Measures one row in this process."""
+    from mjx_balance.quiet import quiet_imports
+
+    with quiet_imports():
+        import jax
+
+        from mjx_balance import training
+        from mjx_balance.env import BalanceEnv
+    from mjx_balance.config import preset
+
+    config = dataclasses.replace(preset(preset_name), num_envs=num_envs)
+    jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+    config = training.size_to_device(config)
+    env = BalanceEnv(config)
+    learner = training.make_learner(config, env)
+    iterations = max(1, DECISIONS_PER_CALL // num_envs)
+    decisions = iterations * num_envs
+
+    state = learner.init(0)
+    raw, raw_compile = _compiled(_random_program(learner, iterations), state.env_state)
+    train, train_compile = _compiled(learner.train_program(iterations), state)
+    env_state = jax.tree.map(lambda x: x.copy(), state.env_state)
+    warm_up = config.dqn.min_replay_size // decisions + 1
+    for _ in range(warm_up):
+        state, _ = train(state)
+    env_state, _ = raw(env_state, jax.random.PRNGKey(0))
+    roll, peer_steps = _peer(env, num_envs)
+    seconds: dict[str, list[float]] = {"mjx env": [], "training": [], "mujoco": []}
+    for k in range(rounds):
+        took, (env_state, _) = _timed(lambda s=env_state, k=k: raw(s, jax.random.PRNGKey(k)))
+        seconds["mjx env"].append(took / (decisions * config.task.sim_steps))
+        took, (state, _) = _timed(lambda s=state: train(s))
+        seconds["training"].append(took / (decisions * config.task.sim_steps))
+        took, _ = _timed(roll)
+        seconds["mujoco"].append(took / peer_steps)
+    rate = {name: 1 / statistics.median(values) for name, values in seconds.items()}
+    device = jax.devices()[0]
+    stats = device.memory_stats() or {}
+    return {
+        "num_envs": num_envs,
+        "preset": preset_name,
+        "updates_per_step": config.dqn.updates_per_step,
+        "device": f"{len(jax.devices())} x {device.device_kind}",
+        "devices_used": config.num_devices,
+        "physics_steps_per_second": rate,
+        "decisions_per_second": {k: v / config.task.sim_steps for k, v in rate.items()},
+        "mjx_over_mujoco": _ratio(seconds["mujoco"], seconds["mjx env"]),
+        "training_over_mjx": _ratio(seconds["mjx env"], seconds["training"]),
+        "compile_s": {"mjx env": raw_compile, "training": train_compile},
+        "peak_host_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_device_memory_mib": stats.get("peak_bytes_in_use", 0) / 2**20 or None,
+    }
+
+
+def _random_program(learner, iterations: int) -> Callable[..., Any]:
+    """The env alone: random actions, done robots reset, as in training."""
+    import jax
+    import jax.numpy as jnp
+
+    from mjx_balance.dqn.learner import AXIS, REPLICATED, SHARDED
+
+    def step(state, key):
+        key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
+        count = state.reward.shape[0]
+        action = jax.random.randint(key, (count,), 0, learner.env.action_size)
+        return learner.reset_done(jax.vmap(learner.env.step)(state, action), key), None
+
+    def program(state, key):
+        state, _ = jax.lax.scan(step, state, jax.random.split(key, iterations))
+        return state, jnp.zeros(())
+
+    return jax.jit(
+        jax.shard_map(
+            program,
+            mesh=learner.mesh,
+            in_specs=(SHARDED, REPLICATED),
+            out_specs=(SHARDED, REPLICATED),
+            check_vma=False,
+        )
+    )
+
+
+def _compiled(program: Callable[..., Any], state: Any) -> tuple[Callable[..., Any], float]:
+    import jax
+    from brax.envs.base import State
+
+    arguments = (state, jax.random.PRNGKey(0)) if isinstance(state, State) else (state,)
+    began = time.perf_counter()
+    return program.lower(*arguments).compile(), time.perf_counter() - began  # pyright: ignore
+
+
+def _peer(env, num_envs: int) -> tuple[Callable[[], Any], int]:
+    """One decision of MuJoCo's C engine from the standing state, random actions."""
+    import numpy as np
+    from mujoco.batch import Batch
+
+    from mjx_balance.plant import decision_ctrl, standing_heights
+    from mjx_balance.task.actions import action_table, apply_action
+    from mjx_balance.task.tilt import Scenario
+
+    config, scene = env.config, env.scene
+    rng = np.random.default_rng(0)
+    before = np.tile(standing_heights(config), (num_envs, 1))
+    change = action_table(config.task)[rng.integers(env.action_size, size=num_envs)]
+    after = apply_action(config.task, config.robot, before, change)
+    scenario = Scenario(rng.uniform(-5, 5, (num_envs, 2, 2)), np.zeros(num_envs))
+    ctrl = decision_ctrl(config, scene, scenario, np.zeros(num_envs), before, after)
+    batch = Batch(scene.model, num_envs, os.cpu_count() or 1)
+    repeats = max(1, DECISIONS_PER_CALL // num_envs)
+
+    def roll() -> None:
+        for _ in range(repeats):
+            batch.qpos, batch.qvel = scene.stance.qpos, scene.stance.qvel
+            batch.qacc_warmstart = scene.stance.qacc_warmstart
+            batch.rollout(config.task.sim_steps, ctrl, record=("qpos", "sensordata"))
+
+    return roll, repeats * num_envs * config.task.sim_steps
+
+
+def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    import jax
+
+    began = time.perf_counter()
+    result = jax.block_until_ready(call())
+    return time.perf_counter() - began, result
+
+
+def _ratio(slower: list[float], faster: list[float]) -> float:
+    """Median over the rounds of the rate of the second over that of the first."""
+    return statistics.median(a / b for a, b in zip(slower, faster, strict=True))
+
+
+def hardware() -> dict[str, Any]:
+    """What this was measured on."""
+    model = platform.processor()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        names = [x for x in cpuinfo.read_text().splitlines() if x.startswith("model name")]
+        model = names[0].split(":", 1)[1].strip() if names else model
+    return {"cpu": model, "cores": os.cpu_count(), "system": platform.platform()}
+
+
+def main() -> None:
+    """Measures every row and prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
+    parser.add_argument("--num-envs", type=int, nargs="+", default=[64, 256, 1024])
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--json", type=Path, help="file to write the figures to")
+    parser.add_argument("--row", type=int, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.row:
+        print(json.dumps(measure(args.row, args.preset, args.rounds)))
+        return
+    rows = []
+    flags = ["--preset", args.preset, "--rounds", str(args.rounds)]
+    for num_envs in args.num_envs:
+        print(f"measuring {num_envs} envs ...", file=sys.stderr, flush=True)
+        command = [sys.executable, __file__, "--row", str(num_envs), *flags]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+        rows.append(json.loads(done.stdout.splitlines()[-1]))
+    machine = hardware()
+    print(f"{machine['cpu']}, {machine['cores']} cores, {rows[0]['device']}; medians of rounds")
+    print("physics steps/s (decisions/s)")
+    print(
+        "| envs | mjx env | training | mujoco Batch | mjx / mujoco | training / mjx "
+        "| compile env, training | host memory |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for row in rows:
+        rates, decisions = row["physics_steps_per_second"], row["decisions_per_second"]
+        cells = [f"{rates[k]:,.0f} ({decisions[k]:,.0f})" for k in rates]
+        compiles = [f"{s:.0f} s" for s in row["compile_s"].values()]
+        print(
+            f"| {row['num_envs']} | {' | '.join(cells)} | {row['mjx_over_mujoco']:.2f} "
+            f"| {row['training_over_mjx']:.2f} | {', '.join(compiles)} "
+            f"| {row['peak_host_memory_mib']:,.0f} MiB |"
+        )
+    if args.json:
+        args.json.write_text(json.dumps({"hardware": machine, "rows": rows}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

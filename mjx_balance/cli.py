@@ -1,0 +1,153 @@
+"""The command line: `mjx-balance train` and `mjx-balance evaluate`."""
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from mjx_balance.config import Config, ConfigError, preset
+from mjx_balance.policy import PolicyError, load_policy
+from mjx_balance.quiet import quiet_imports
+
+USAGE_ERROR = 2
+INTERRUPTED = 130
+COMMANDS = ("train", "evaluate")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainArgs:
+    """Train a policy in MJX, export it and evaluate it in plain MuJoCo."""
+
+    run_dir: Path | None = None
+    """Folder to create for the run; none: runs/PRESET-SEED-TIME."""
+    resume: Path | None = None
+    """Run folder to continue instead."""
+    config: tyro.conf.OmitArgPrefixes[Config] = dataclasses.field(default_factory=Config)
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateArgs:
+    """Evaluate an exported policy in plain MuJoCo on all cores. Needs no JAX."""
+
+    policy: Annotated[Path, tyro.conf.Positional]
+    """Policy file."""
+    suite: str = "paper"
+    """Kind of tilt scenarios: paper or corner."""
+    scenarios: int = 256
+    """How many of them."""
+    duration: float = 60.0
+    """Length of each, s."""
+    seed: int = 0
+    """Seed that draws them."""
+    json: Path | None = None
+    """File to write the figures to."""
+    video: Path | None = None
+    """MP4 to write of the first scenario."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command; returns its exit code, 2 for input that cannot be used."""
+    argv = list(sys.argv[1:] if arguments is None else arguments)
+    if not argv or argv[0] not in COMMANDS:
+        wants_help = bool(argv) and argv[0] in ("-h", "--help")
+        print("usage: mjx-balance {train,evaluate} ... (--help after either lists its flags)")
+        if argv and not wants_help:
+            _complain(f"unknown command {argv[0]!r}; known commands: {', '.join(COMMANDS)}")
+        return 0 if wants_help else USAGE_ERROR
+    return {"train": _train, "evaluate": _evaluate}[argv[0]](argv[1:])
+
+
+def _train(argv: list[str]) -> int:
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset")
+    early.add_argument("--resume", type=Path)
+    known, _ = early.parse_known_args(argv)
+    try:
+        if known.resume is None:
+            default = TrainArgs(config=preset(known.preset or "default"))
+        else:
+            with quiet_imports():
+                from mjx_balance.training import read_run_config
+            default = TrainArgs(config=read_run_config(known.resume))
+    except ValueError as error:
+        return _complain(str(error))
+    parsed = tyro.cli(TrainArgs, args=argv, prog="mjx-balance train", default=default)
+    if parsed.resume and parsed.run_dir:
+        return _complain("--resume continues a folder in place; leave --run-dir out")
+
+    with quiet_imports():
+        from mjx_balance import training
+    from mjx_balance.checkpoint import CheckpointError
+    from mjx_balance.display import Display
+
+    display = Display()
+    try:
+        training.train(parsed.config, parsed.run_dir, parsed.resume, display)
+    except (ConfigError, training.RunFolderError, CheckpointError) as error:
+        return _complain(str(error))
+    except training.Interrupted as stopped:
+        display.say(str(stopped))
+        return INTERRUPTED
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    return 0
+
+
+def _evaluate(argv: list[str]) -> int:
+    args = tyro.cli(EvaluateArgs, args=argv, prog="mjx-balance evaluate")
+    from mjx_balance import evaluation, report
+    from mjx_balance.display import Display
+
+    display = Display(Console(stderr=True))
+    try:
+        for path in (args.json, args.video):
+            if path is not None and not path.absolute().parent.is_dir():
+                return _complain(f"cannot write {path}: its folder does not exist")
+        policy = load_policy(args.policy)
+        with display.bar(f"evaluating, suite {args.suite}") as bar:
+            result = evaluation.evaluate(
+                policy, args.suite, args.scenarios, args.duration, args.seed, bar
+            )
+        if args.json:
+            args.json.write_text(json.dumps(result, indent=2) + "\n")
+        Console().print(report.evaluation_table({args.suite: result}))
+        speed = result["physics_steps_per_second"]
+        print(f"{speed:,.0f} physics steps per second")
+        if args.video:
+            return _video(policy, args)
+    except (PolicyError, evaluation.EvaluationError) as error:
+        return _complain(str(error))
+    except OSError as error:
+        return _complain(f"cannot write {error.filename}: {error.strerror}")
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    return 0
+
+
+def _video(policy, args: EvaluateArgs) -> int:
+    from mjx_balance import render, report
+
+    assert args.video is not None
+    config, qpos = report.record(policy, args.suite, args.duration, args.seed)
+    try:
+        render.write(args.video, config, qpos)
+    except render.RenderError as error:
+        print(f"mjx-balance: no video written: {error}", file=sys.stderr)
+        return 1
+    print(f"video of the first scenario: {args.video}")
+    return 0
+
+
+def _complain(message: str) -> int:
+    print(f"mjx-balance: {message}", file=sys.stderr)
+    return USAGE_ERROR
+
+
+if __name__ == "__main__":
+    sys.exit(main())

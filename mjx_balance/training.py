@@ -1,0 +1,365 @@
+"""A run: its folder, the loop, checkpoints, and at the end the policy and its evaluation."""
+
+import dataclasses
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+from tensorboardX import SummaryWriter
+
+from mjx_balance import evaluation, report
+from mjx_balance.checkpoint import Checkpoints
+from mjx_balance.config import Config, ConfigError, check, from_dict, to_dict
+from mjx_balance.display import Display
+from mjx_balance.dqn.learner import Learner, TrainState
+from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.env import BalanceEnv
+from mjx_balance.policy import Policy, load_policy, make_manifest, save_policy
+from mjx_balance.program_cache import compile_cached, digest, enable_compilation_cache
+
+CPU_ENVS = 256
+ACCELERATOR_ENVS = 2048
+EVALUATION_SEED = 1_000_000
+"""Seed of the final evaluation's scenarios; training draws from other generators."""
+
+
+class RunFolderError(ValueError):
+    """A run folder that cannot be used; the message says why and what would do."""
+
+
+class Interrupted(Exception):
+    """The user stopped the run; everything is saved."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+    """Where everything of a run lies."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        return self.path / "config.json"
+
+    @property
+    def metrics(self) -> Path:
+        return self.path / "metrics.jsonl"
+
+    @property
+    def tensorboard(self) -> Path:
+        return self.path / "tensorboard"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def policy(self) -> Path:
+        return self.path / "policy.safetensors"
+
+    @property
+    def evaluation(self) -> Path:
+        return self.path / "evaluation.json"
+
+    @property
+    def figures(self) -> Path:
+        return self.path / "figures"
+
+
+def create_run_folder(path: Path, config: Config) -> RunFolder:
+    """Makes a new run folder.
+
+    Raises:
+      RunFolderError: if it exists or cannot be written; nothing is touched then.
+    """
+    if path.exists():
+        raise RunFolderError(
+            f"run folder {path} exists; choose another with --run-dir, or continue it with "
+            f"--resume {path}"
+        )
+    try:
+        path.mkdir(parents=True)
+        folder = RunFolder(path)
+        folder.config.write_text(json.dumps(to_dict(config), indent=2) + "\n")
+    except OSError as error:
+        raise RunFolderError(
+            f"run folder {path} cannot be written: {error.strerror}; choose another with --run-dir"
+        ) from error
+    return folder
+
+
+def read_run_config(path: Path) -> Config:
+    """Reads the config of an existing run.
+
+    Raises:
+      RunFolderError: if `path` is no run folder, or its run is finished.
+    """
+    folder = RunFolder(path)
+    if not folder.config.is_file():
+        raise RunFolderError(f"{path} is no run folder: it has no config.json")
+    if folder.evaluation.is_file():
+        raise RunFolderError(f"the run in {path} is finished; start a new one with --run-dir")
+    try:
+        return check(from_dict(Config, json.loads(folder.config.read_text())))
+    except (ValueError, TypeError, OSError) as error:
+        raise RunFolderError(f"{folder.config} cannot be used: {error}") from error
+
+
+def check_same_config(saved: Config, wanted: Config, path: Path) -> None:
+    """Refuses to resume a run as another one.
+
+    Raises:
+      RunFolderError: naming the first field that differs.
+    """
+    before, after = _flatten(to_dict(saved)), _flatten(to_dict(wanted))
+    for name, value in after.items():
+        if before[name] != value:
+            raise RunFolderError(
+                f"{path} was started with {name} = {before[name]}, not {value}; resume it "
+                "without that flag, or start a new run"
+            )
+
+
+def configure_jax(config: Config) -> None:
+    """Splits a CPU into devices and turns the compilation cache on; call before JAX is used."""
+    jax.config.update("jax_num_cpu_devices", config.num_devices or os.cpu_count() or 1)
+    enable_compilation_cache()
+
+
+def size_to_device(config: Config) -> Config:
+    """Fills in what the config leaves to the device.
+
+    Raises:
+      ConfigError: if the boards cannot be spread over that many devices.
+    """
+    available = jax.devices()
+    on_cpu = available[0].platform == "cpu"
+    num_envs = config.num_envs or (CPU_ENVS if on_cpu else ACCELERATOR_ENVS)
+    if config.num_devices is None:
+        # As many as share the boards and the batch out evenly.
+        num_devices = next(
+            n
+            for n in range(len(available), 0, -1)
+            if num_envs % n == 0 and config.dqn.batch_size % n == 0
+        )
+    else:
+        num_devices = config.num_devices
+        if num_devices > len(available):
+            raise ConfigError(
+                f"num_devices is {num_devices}; this machine has {len(available)} JAX devices"
+            )
+        for name, value in (("num_envs", num_envs), ("batch_size", config.dqn.batch_size)):
+            if value % num_devices:
+                raise ConfigError(
+                    f"{name} is {value}; it must be a multiple of num_devices, {num_devices}"
+                )
+    return check(dataclasses.replace(config, num_envs=num_envs, num_devices=num_devices))
+
+
+def make_learner(config: Config, env: BalanceEnv) -> Learner:
+    """The DQN for a config that `size_to_device` has completed."""
+    assert config.num_envs is not None
+    assert config.num_devices is not None
+    return Learner(
+        env,
+        QNetwork(config.dqn.hidden_sizes, action_factors(config, env)),
+        config.dqn,
+        config.num_envs,
+        config.num_env_steps,
+        jax.devices()[: config.num_devices],
+    )
+
+
+def action_factors(config: Config, env: BalanceEnv) -> tuple[int, ...]:
+    """Output branches of the network: all actions at once, or roll and pitch apart."""
+    return env.action_factors if config.dqn.head == "factored" else (env.action_size,)
+
+
+def train(
+    config: Config, run_dir: Path | None, resume: Path | None, display: Display
+) -> dict[str, Any]:
+    """Runs or continues a training and everything that follows it.
+
+    Args:
+      config: what to train; when resuming, what the folder's own config must equal.
+      run_dir: folder to create; one named after preset, seed and time if none.
+      resume: folder to continue instead.
+      display: shows progress.
+
+    Returns:
+      The evaluation, suite name -> JSON of `evaluation.summarize`.
+
+    Raises:
+      ConfigError: for an impossible config.
+      RunFolderError: for a folder that cannot be used.
+      Interrupted: if the user stopped the run, after saving it.
+    """
+    began = time.perf_counter()
+    check(config)
+    configure_jax(config)
+    sized = size_to_device(config)
+    env = BalanceEnv(sized)
+    if resume is None:
+        name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+        folder = create_run_folder(run_dir or Path("runs") / name, sized)
+    else:
+        folder = RunFolder(resume)
+        saved = read_run_config(resume)
+        check_same_config(saved, sized, resume)
+    with _stop_on_interrupt() as stop:
+        state, seconds = _learn(sized, env, folder, resume is not None, display, stop)
+        policy = _export(sized, env, folder, state, seconds)
+        if stop:
+            raise Interrupted(
+                f"stopped at {int(state.env_steps):,} decisions; the policy so far is "
+                f"{folder.policy}; continue with --resume {folder.path}"
+            )
+    results = _evaluate(sized, policy, folder, display)
+    with display.phase("drawing figures"):
+        report.draw_figures(folder.path, load_policy(folder.policy))
+    folder.evaluation.write_text(json.dumps(results, indent=2) + "\n")
+    report.print_summary(display.console, folder.path, results, time.perf_counter() - began)
+    return results
+
+
+def _learn(
+    config: Config,
+    env: BalanceEnv,
+    folder: RunFolder,
+    resume: bool,
+    display: Display,
+    stop: list[int],
+) -> tuple[TrainState, float]:
+    """Trains until the last decision, or until the user stops; saves either way.
+
+    Returns:
+      The last state, and the seconds spent learning by this call.
+    """
+    learner = make_learner(config, env)
+    display.say(
+        f"{folder.path}: preset {config.preset}, seed {config.seed}, {config.num_envs} boards on "
+        f"{config.num_devices} {jax.devices()[0].device_kind} device(s)"
+    )
+    checkpoints = Checkpoints(folder.checkpoints)
+    assert config.num_envs is not None
+    per_call = max(1, config.log_every // config.num_envs) * config.num_envs
+    with display.phase("compiling (about a minute the first time, seconds from then on)"):
+        state = learner.init(config.seed)
+        key = digest(to_dict(config), per_call)
+        program = compile_cached(learner.train_program(per_call // config.num_envs), state, key)
+    if resume:
+        state = checkpoints.restore(state)
+        display.say(f"resuming at {int(state.env_steps):,} decisions")
+    _drop_metrics_after(folder.metrics, int(state.env_steps))
+
+    total = -(-config.num_env_steps // per_call) * per_call
+    done, saved_at, seconds = int(state.env_steps), int(state.env_steps), 0.0
+    with (
+        folder.metrics.open("a") as log,
+        SummaryWriter(str(folder.tensorboard)) as board,
+        display.training(done, total),
+    ):
+        while done < total and not stop:
+            began = time.perf_counter()
+            state, raw = program(state)
+            done = int(state.env_steps)
+            elapsed = time.perf_counter() - began
+            seconds += elapsed
+            metrics = _named(config, raw, per_call / elapsed)
+            line = {"env_steps": done, "gradient_steps": int(state.gradient_steps), **metrics}
+            log.write(json.dumps(line) + "\n")
+            log.flush()
+            for name, value in metrics.items():
+                board.add_scalar(name, value, done)
+            display.update(done, metrics)
+            if done // config.checkpoint_every > saved_at // config.checkpoint_every:
+                checkpoints.save(done, state)
+                saved_at = done
+    checkpoints.save(done, state)
+    checkpoints.close()
+    return state, seconds
+
+
+def _named(config: Config, raw: dict[str, jax.Array], rate: float) -> dict[str, float]:
+    """Metrics under the names they are logged by."""
+    metrics = {f"train/{name}": float(value) for name, value in raw.items()}
+    falls = metrics.pop("train/fall")
+    metrics["train/falls_per_minute"] = falls * 60 / config.task.ctrl_dt
+    metrics["perf/env_steps_per_second"] = rate
+    metrics["perf/physics_steps_per_second"] = rate * config.task.sim_steps
+    return metrics
+
+
+def _export(
+    config: Config, env: BalanceEnv, folder: RunFolder, state: TrainState, seconds: float
+) -> Policy:
+    provenance = {
+        "env_steps": int(state.env_steps),
+        "gradient_steps": int(state.gradient_steps),
+        "seconds_learning_since_start_or_resume": round(seconds, 1),
+        "device": jax.devices()[0].device_kind,
+        "date": time.strftime("%Y-%m-%d"),
+    }
+    manifest = make_manifest(config, env.scene.hash, action_factors(config, env), provenance)
+    return save_policy(folder.policy, jax.device_get(state.params), manifest)
+
+
+def _evaluate(
+    config: Config, policy: Policy, folder: RunFolder, display: Display
+) -> dict[str, dict[str, Any]]:
+    results = {}
+    for suite in evaluation.SUITES:
+        with display.bar(f"evaluating in plain MuJoCo, suite {suite}") as bar:
+            results[suite] = evaluation.evaluate(
+                policy, suite, config.eval_scenarios, config.eval_duration, EVALUATION_SEED, bar
+            )
+    with SummaryWriter(str(folder.tensorboard)) as board:
+        for suite, result in results.items():
+            board.add_scalar(f"eval/{suite}/falls", result["falls"], config.num_env_steps)
+            for name, value in result["tilt_deg"].items():
+                board.add_scalar(f"eval/{suite}/tilt_{name}", value, config.num_env_steps)
+    return results
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[list[int]]:
+    """Collects interrupt signals, so that the loop can stop between two calls.
+
+    A second one interrupts at once.
+    """
+    received: list[int] = []
+
+    def handler(number: int, frame: object) -> None:
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
+
+    previous = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        previous[number] = signal.signal(number, handler)
+    try:
+        yield received
+    finally:
+        for number, old in previous.items():
+            signal.signal(number, old)
+
+
+def _drop_metrics_after(path: Path, env_steps: int) -> None:
+    """Removes lines that a resumed run will write again."""
+    if path.is_file():
+        lines = path.read_text().splitlines()
+        kept = [x for x in lines if json.loads(x)["env_steps"] <= env_steps]
+        path.write_text("".join(f"{x}\n" for x in kept))
+
+
+def _flatten(values: dict[str, Any]) -> dict[str, Any]:
+    flat = {}
+    for name, value in values.items():
+        flat |= _flatten(value) if isinstance(value, dict) else {name: value}
+    return flat

@@ -1,0 +1,75 @@
+"""Tiny brax environments whose action values are known."""
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+
+class Probe(Env):
+    """Base: observation (1,), two actions."""
+
+    @property
+    def observation_size(self) -> int:
+        return 1
+
+    @property
+    def action_size(self) -> int:
+        return 2
+
+    @property
+    def backend(self) -> str:
+        return "probe"
+
+    def reset(self, rng: jax.Array) -> State:
+        zero = jnp.float32(0.0)
+        info = {"truncation": zero}
+        return State(None, jnp.zeros(1), zero, zero, {}, info)
+
+    def _next(self, state: State, obs, reward, terminated, truncation=0.0) -> State:
+        terminated, truncation = jnp.float32(terminated), jnp.float32(truncation)
+        return state.replace(
+            obs=jnp.full(1, obs, jnp.float32),
+            reward=jnp.float32(reward),
+            done=jnp.maximum(terminated, truncation),
+            info=state.info | {"truncation": truncation},
+        )
+
+
+class OneStep(Probe):
+    """Every step earns 1 and ends the episode: q = 1."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._next(state, 0.0, 1.0, terminated=1.0)
+
+
+class TwoSteps(Probe):
+    """Earns nothing, then 1: q(0) = gamma, q(1) = 1."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        second = state.obs[0]
+        return self._next(state, 1 - second, second, terminated=second)
+
+
+class ChooseRight(Probe):
+    """Action 1 earns 1, action 0 loses 1: q = (-1, 1)."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._next(state, 0.0, 2.0 * action - 1, terminated=1.0)
+
+
+class TimeOut(Probe):
+    """Earns 1 for ever, cut off after every step: q = 1 / (1 - gamma)."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._next(state, 0.0, 1.0, terminated=0.0, truncation=1.0)
+
+
+class NoisyState(Probe):
+    """A random observation each step, reward its product with +-1 by action."""
+
+    def reset(self, rng: jax.Array) -> State:
+        state = super().reset(rng)
+        return state.replace(obs=jax.random.uniform(rng, (1,), minval=-1.0))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._next(state, 0.0, state.obs[0] * (2.0 * action - 1), terminated=1.0)

@@ -1,0 +1,107 @@
+"""Bad input: one sentence, exit code 2, nothing touched."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from mjx_balance.cli import main
+from mjx_balance.config import preset, to_dict
+
+
+@pytest.fixture(autouse=True)
+def _in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Runs a command that must be refused; returns what it said."""
+    try:
+        code = main(arguments)
+    except SystemExit as stopped:  # tyro's own refusals
+        code = stopped.code
+    assert code == 2
+    said = capsys.readouterr()
+    return said.err + said.out
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--preset", "huge"), "unknown preset 'huge'; known presets: paper, default, smoke"),
+        (("--warp-speed", "9"), "--warp-speed"),
+        (("--gamma", "much"), "--gamma"),
+        (("--gamma", "1.5"), "gamma is 1.5"),
+        (("--target-period", "3"), "target_period is 3.0 s"),
+        (("--ctrl-dt", "0"), "ctrl_dt is 0.0"),
+        (("--ctrl-dt", "0.0101"), "ctrl_dt is 0.0101 s; it must be a whole multiple"),
+        (("--max-incline", "12"), "max_incline is 12.0 deg"),
+        (("--num-envs", "0"), "num_envs is 0"),
+        (("--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
+        (("--thigh", "0.25"), "thigh is 0.25"),
+        (("--learning-rate", "nan"), "learning_rate is nan"),
+        (("--resume", "nowhere"), "nowhere is no run folder"),
+    ],
+)
+def test_impossible_training_is_refused(
+    capsys: pytest.CaptureFixture[str], flags: tuple[str, ...], named: str, tmp_path: Path
+) -> None:
+    assert named in " ".join(refuse(capsys, "train", *flags).split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_run_folder_is_left_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("precious")
+    said = refuse(capsys, "train", "--preset", "smoke", "--run-dir", "mine")
+    assert "run folder mine exists" in said
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_an_unwritable_run_folder_is_said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    said = refuse(capsys, "train", "--preset", "smoke", "--run-dir", "file/run")
+    assert "run folder file/run cannot be written" in said
+
+
+def test_resuming_with_another_config_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    values = to_dict(preset("smoke")) | {"num_devices": 1}
+    (run / "config.json").write_text(json.dumps(values))
+    said = refuse(capsys, "train", "--resume", "run", "--gamma", "0.9")
+    assert "run was started with gamma = 0.1, not 0.9" in said
+    said = refuse(capsys, "train", "--resume", "run", "--preset", "paper")
+    assert "run was started with preset = smoke, not paper" in said
+    assert os.listdir(run) == ["config.json"]
+
+
+def test_resuming_a_finished_run_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(preset("smoke"))))
+    (tmp_path / "evaluation.json").write_text("{}")
+    assert "is finished" in refuse(capsys, "train", "--resume", str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("fly",), "unknown command 'fly'; known commands: train, evaluate"),
+        (("evaluate", "none.safetensors"), "no policy file at none.safetensors"),
+        (("evaluate", "text"), "text is damaged or no safetensors file"),
+        (("evaluate", "text", "--json", "no/such/out.json"), "cannot write no/such/out.json"),
+    ],
+)
+def test_impossible_commands_are_refused(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], named: str, tmp_path: Path
+) -> None:
+    (tmp_path / "text").write_text("this is no policy")
+    assert named in refuse(capsys, *arguments)

@@ -1,0 +1,95 @@
+"""The house: a module imports only from lower floors, read from its syntax tree."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import mjx_balance
+
+PACKAGE = Path(mjx_balance.__file__).resolve().parent
+
+FLOORS = (
+    ("config", "quiet"),
+    ("task", "task.actions", "task.legs", "task.observation", "task.reward", "task.tilt"),
+    ("scene", "policy", "dqn", "dqn.networks", "dqn.replay", "dqn.losses"),
+    ("plant", "dqn.learner"),
+    ("physics", "evaluation"),
+    ("env", "render", "report", "display", "checkpoint", "program_cache"),
+    ("training",),
+    ("cli",),
+    ("__main__",),
+)
+FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
+WITHOUT_JAX = set("config quiet task scene plant policy evaluation render report display".split())
+JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
+
+
+def module_name(path: Path) -> str:
+    """`task/legs.py` -> `task.legs`, `task/__init__.py` -> `task`, `__init__.py` -> ``."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(part for part in parts if part != "__init__")
+
+
+MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+INSIDE = sorted(name for name in MODULES if name)
+
+
+def imported(name: str) -> set[str]:
+    """Full dotted names that a module imports anywhere, functions included."""
+    found = set()
+    for node in ast.walk(ast.parse(MODULES[name].read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{name} has a relative import; write it in full"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def imported_modules(name: str) -> set[str]:
+    """Modules of the package that a module imports; `` is the package's own __init__."""
+    found = set()
+    for target in imported(name):
+        root, *parts = target.split(".")
+        if root == PACKAGE.name:
+            while parts and ".".join(parts) not in MODULES:
+                parts.pop()
+            found.add(".".join(parts))
+    return found
+
+
+def test_every_module_has_a_floor() -> None:
+    unknown = [name for name in INSIDE if name not in FLOOR]
+    assert not unknown, f"{unknown} have no floor yet: give them one in tests/test_layout.py"
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_module_imports_only_from_lower_floors(name: str) -> None:
+    for target in imported_modules(name):
+        assert target, f"{name} imports from the package itself; name the module"
+        if target == "task" and name.startswith("task."):
+            continue  # its __init__ holds the shared Array type
+        floor, below = FLOOR.get(name), FLOOR.get(target)
+        assert floor is not None, f"{name} has no floor yet"
+        assert below is not None, f"{name} imports {target}, which has no floor yet"
+        assert below < floor, f"{name} (floor {floor}) imports {target} (floor {below})"
+
+
+@pytest.mark.parametrize("name", [name for name in INSIDE if name.startswith("dqn")])
+def test_learner_knows_no_robot(name: str) -> None:
+    strangers = [t for t in imported_modules(name) if t != "config" and not t.startswith("dqn")]
+    assert not strangers, f"{name} imports {strangers}"
+
+
+@pytest.mark.parametrize("name", [n for n in INSIDE if n.split(".")[0] in WITHOUT_JAX])
+def test_module_needs_no_jax(name: str) -> None:
+    used = {target.split(".")[0] for target in imported(name)} & JAX
+    assert not used, f"{name} imports {used}"
+    assert "mujoco.mjx" not in imported(name)
+
+
+@pytest.mark.parametrize("name", [n for n in INSIDE if n.split(".")[0] in WITHOUT_JAX])
+def test_module_needs_no_module_that_needs_jax(name: str) -> None:
+    for target in imported_modules(name):
+        assert target.split(".")[0] in WITHOUT_JAX, f"{name} imports {target}"

@@ -1,0 +1,68 @@
+"""The Q-network: one output per action, or one per level and axis, added up."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_balance.dqn.networks import QNetwork
+
+KEY = jax.random.PRNGKey(0)
+
+
+def random_params(network: QNetwork) -> Any:
+    """Weights and biases for 34 inputs, all of them random."""
+    rng = np.random.default_rng(0)
+    shapes = jax.eval_shape(network.init, KEY, jnp.zeros(34))
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), shapes)
+
+
+def random_obs(*shape: int) -> jax.Array:
+    return jnp.asarray(np.random.default_rng(1).normal(size=shape), jnp.float32)
+
+
+@pytest.mark.parametrize(
+    ("factors", "outputs", "actions"),
+    [((441,), 441, 441), ((21, 21), 42, 441), ((2, 3, 4), 9, 24)],
+)
+def test_shapes(factors: tuple[int, ...], outputs: int, actions: int) -> None:
+    network = QNetwork((16, 8), factors)
+    params = jax.eval_shape(network.init, KEY, jnp.zeros(34))
+    shapes = jax.tree.map(lambda x: x.shape, params["params"])
+    assert shapes["hidden_0"] == {"kernel": (34, 16), "bias": (16,)}
+    assert shapes["hidden_1"] == {"kernel": (16, 8), "bias": (8,)}
+    assert shapes["head"] == {"kernel": (8, outputs), "bias": (outputs,)}
+    for batch in ((), (5,), (2, 3)):
+        obs = jax.ShapeDtypeStruct((*batch, 34), jnp.float32)
+        assert jax.eval_shape(network.apply, params, obs).shape == (*batch, actions)
+
+
+def test_value_of_an_action_is_the_sum_of_its_levels() -> None:
+    """Action 21 i + j is worth branch_x[i] + branch_y[j]; so the best is the best of each."""
+    obs = random_obs(50, 34)
+    params = random_params(QNetwork((16,), (21, 21)))
+    values = np.asarray(QNetwork((16,), (21, 21)).apply(params, obs))
+    x, y = np.split(np.asarray(QNetwork((16,), (42,)).apply(params, obs)), 2, axis=-1)
+    np.testing.assert_allclose(values.reshape(50, 21, 21), x[:, :, None] + y[:, None], rtol=1e-5)
+    best = 21 * x.argmax(axis=-1) + y.argmax(axis=-1)
+    np.testing.assert_array_equal(values.argmax(axis=-1), best)
+
+
+def test_three_factors_are_a_mixed_radix_number() -> None:
+    obs = random_obs(34)
+    params = random_params(QNetwork((), (2, 3, 4)))
+    values = np.asarray(QNetwork((), (2, 3, 4)).apply(params, obs))
+    a, b, c = np.split(np.asarray(QNetwork((), (9,)).apply(params, obs)), (2, 5))
+    assert values[1 * 12 + 2 * 4 + 3] == pytest.approx(a[1] + b[2] + c[3], rel=1e-5)
+
+
+@pytest.mark.parametrize("factors", [(441,), (21, 21)])
+def test_gradient_of_one_action_reaches_every_layer(factors: tuple[int, ...]) -> None:
+    network, obs = QNetwork((16, 16), factors), random_obs(34)
+    value = jax.jit(lambda params: jnp.asarray(network.apply(params, obs))[100])
+    grads = jax.grad(value)(random_params(network))
+    for leaf in map(np.asarray, jax.tree.leaves(grads)):
+        assert np.abs(leaf).max() > 0
+    assert np.count_nonzero(grads["params"]["head"]["bias"]) == len(factors)

@@ -1,0 +1,113 @@
+"""The whole of `train.py`, as a user runs it: a run, an interrupted run, a resumed one."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjx_balance import load_policy
+
+REPO = Path(__file__).parent.parent
+FLAGS = (
+    "--preset smoke --num-env-steps 6144 --eval-scenarios 8 --eval-duration 10 "
+    "--checkpoint-every 2048"
+).split()
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """An environment with a compilation cache of its own."""
+    return os.environ | {"MJX_BALANCE_CACHE": str(tmp_path_factory.mktemp("cache"))}
+
+
+def start(cache: dict[str, str], *flags: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(REPO / "train.py"), *flags],
+        env=cache,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def run(cache: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A finished run."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    process = start(cache, *FLAGS, "--run-dir", str(folder))
+    out, err = process.communicate()
+    assert process.returncode == 0, out + err
+    assert "Failed to import" not in out + err
+    yield folder
+
+
+def test_a_run_leaves_everything_behind(run: Path) -> None:
+    figures = {"learning_curves.png", "reward.png", "rollout.png"}
+    assert {p.name for p in (run / "figures").iterdir()} == figures
+    assert list((run / "tensorboard").iterdir())
+    assert list((run / "checkpoints").iterdir())
+    results = json.loads((run / "evaluation.json").read_text())
+    assert set(results) == {"paper", "corner"}
+    assert results["corner"]["scenarios"] == 8
+    config = json.loads((run / "config.json").read_text())
+    assert config["preset"] == "smoke"
+    policy = load_policy(run / "policy.safetensors")
+    assert policy.manifest["training"]["env_steps"] == 6144
+    assert policy(np.zeros((3, policy.observation_size))).shape == (3,)
+
+
+def test_metrics_are_logged_and_the_loss_falls(run: Path) -> None:
+    lines = [json.loads(x) for x in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [x["env_steps"] for x in lines] == list(range(1024, 6145, 1024))
+    names = "tilt_deg falls_per_minute reward loss epsilon".split()
+    for line in lines:
+        assert {f"train/{n}" for n in names} <= set(line)
+        assert line["perf/physics_steps_per_second"] == pytest.approx(
+            50 * line["perf/env_steps_per_second"]
+        )
+    assert lines[-1]["train/loss"] < lines[0]["train/loss"]
+    assert lines[-1]["train/epsilon"] < lines[0]["train/epsilon"]
+
+
+def test_an_interrupted_and_resumed_run_equals_an_uninterrupted_one(
+    run: Path, cache: dict[str, str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    process = start(cache, *FLAGS, "--run-dir", str(folder))
+    metrics = folder / "metrics.jsonl"
+    while not (metrics.is_file() and metrics.read_text()) and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    assert process.returncode == 130, out + err
+    assert "--resume" in out
+    assert load_policy(folder / "policy.safetensors").manifest["training"]["env_steps"] < 6144
+
+    process = start(cache, "--resume", str(folder))
+    out, err = process.communicate()
+    assert process.returncode == 0, out + err
+    whole, resumed = (load_policy(p / "policy.safetensors") for p in (run, folder))
+    obs = np.random.default_rng(0).normal(size=(50, whole.observation_size))
+    np.testing.assert_array_equal(whole.q_values(obs), resumed.q_values(obs))
+    steps = [json.loads(x)["env_steps"] for x in metrics.read_text().splitlines()]
+    assert steps == list(range(1024, 6145, 1024))
+
+
+def test_a_second_start_compiles_nothing(run: Path, cache: dict[str, str], tmp_path: Path) -> None:
+    """Tracing and compiling MJX takes a minute; from the cache, seconds."""
+    process = start(cache, *FLAGS, "--run-dir", str(tmp_path / "run"))
+    began = time.perf_counter()
+    metrics = tmp_path / "run" / "metrics.jsonl"
+    while not (metrics.is_file() and metrics.read_text()) and process.poll() is None:
+        time.sleep(0.05)
+    seconds = time.perf_counter() - began
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert seconds < 25
