@@ -39,7 +39,8 @@ def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
     from mjx_balance.config import preset
 
     config = dataclasses.replace(preset(preset_name), num_envs=num_envs)
-    jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+    training.configure_jax()
+    jax.config.update("jax_enable_compilation_cache", False)  # to time the compilation
     config = training.size_to_device(config)
     env = BalanceEnv(config)
     learner = training.make_learner(config, env)

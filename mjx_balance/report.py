@@ -77,6 +77,9 @@ def learning_curves(metrics: list[dict[str, float]]) -> plt.Figure:
         axis.plot(steps, values, color=BLUE, lw=1.6)
         axis.set_title(title)
         axis.set_yscale(scale, **({"linthresh": 0.1} if scale == "symlog" else {}))
+        if name == "train/tilt_deg":
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_formatter("{x:g}")
         if scale in ("linear", "symlog") and name != "train/reward":
             axis.set_ylim(bottom=0)
     for axis in axes[-1]:

@@ -1,12 +1,12 @@
 """A run: its folder, the loop, checkpoints, and at the end the policy and its evaluation."""
 
+import contextlib
 import dataclasses
 import json
 import os
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -126,9 +126,11 @@ def check_same_config(saved: Config, wanted: Config, path: Path) -> None:
             )
 
 
-def configure_jax(config: Config) -> None:
-    """Splits a CPU into devices and turns the compilation cache on; call before JAX is used."""
-    jax.config.update("jax_num_cpu_devices", config.num_devices or os.cpu_count() or 1)
+def configure_jax() -> None:
+    """Makes every CPU core a JAX device and turns the compilation cache on."""
+    # Too late if JAX is already in use, as in a notebook: its devices do as they are.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
     enable_compilation_cache()
 
 
@@ -202,7 +204,7 @@ def train(
     """
     began = time.perf_counter()
     check(config)
-    configure_jax(config)
+    configure_jax()
     sized = size_to_device(config)
     env = BalanceEnv(sized)
     if resume is None:
@@ -327,7 +329,7 @@ def _evaluate(
     return results
 
 
-@contextmanager
+@contextlib.contextmanager
 def _stop_on_interrupt() -> Iterator[list[int]]:
     """Collects interrupt signals, so that the loop can stop between two calls.
 

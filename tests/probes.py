@@ -23,7 +23,7 @@ class Probe(Env):
     def reset(self, rng: jax.Array) -> State:
         zero = jnp.float32(0.0)
         info = {"truncation": zero}
-        return State(None, jnp.zeros(1), zero, zero, {}, info)
+        return State(None, jnp.ones(1), zero, zero, {}, info)
 
     def _next(self, state: State, obs, reward, terminated, truncation=0.0) -> State:
         terminated, truncation = jnp.float32(terminated), jnp.float32(truncation)
@@ -39,29 +39,29 @@ class OneStep(Probe):
     """Every step earns 1 and ends the episode: q = 1."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        return self._next(state, 0.0, 1.0, terminated=1.0)
+        return self._next(state, 1.0, 1.0, terminated=1.0)
 
 
 class TwoSteps(Probe):
-    """Earns nothing, then 1: q(0) = gamma, q(1) = 1."""
+    """Observes 1, then 2; earns nothing, then 1: q(1) = gamma, q(2) = 1."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        second = state.obs[0]
-        return self._next(state, 1 - second, second, terminated=second)
+        second = state.obs[0] - 1
+        return self._next(state, 2 - second, second, terminated=second)
 
 
 class ChooseRight(Probe):
     """Action 1 earns 1, action 0 loses 1: q = (-1, 1)."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        return self._next(state, 0.0, 2.0 * action - 1, terminated=1.0)
+        return self._next(state, 1.0, 2.0 * action - 1, terminated=1.0)
 
 
 class TimeOut(Probe):
     """Earns 1 for ever, cut off after every step: q = 1 / (1 - gamma)."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        return self._next(state, 0.0, 1.0, terminated=0.0, truncation=1.0)
+        return self._next(state, 1.0, 1.0, terminated=0.0, truncation=1.0)
 
 
 class NoisyState(Probe):

@@ -117,7 +117,8 @@ def test_episodes_end_by_the_time_limit(random_episode: Episode) -> None:
         lengths = np.diff(np.concatenate(([-1], ends)))
         assert lengths.max(initial=0) <= EPISODE
         truncated = random_episode.truncation[ends, env] == 1
-        np.testing.assert_array_equal(truncated, lengths == EPISODE)
+        fell = random_episode.fall[ends, env] == 1
+        np.testing.assert_array_equal(truncated, (lengths == EPISODE) & ~fell)
 
 
 def test_reset_clears_the_imu_history_but_not_the_observation_before_it(
@@ -125,14 +126,15 @@ def test_reset_clears_the_imu_history_but_not_the_observation_before_it(
 ) -> None:
     fell = random_episode.fall.astype(bool)
     still = np.asarray(env.scene.stance.imu, np.float32)
-    np.testing.assert_allclose(random_episode.next_start[fell], still + np.zeros((16, 6)))
+    starts = random_episode.next_start[fell]
+    np.testing.assert_array_equal(starts, np.broadcast_to(still, starts.shape))
     # The last observation of a fallen robot shows the fall: degrees of tilt on the accelerometer.
     assert np.abs(random_episode.obs[fell][:, 16:]).max(axis=1).min() > 1
 
 
 def test_mjx_moves_as_plain_mujoco_does(config: Config, env: BalanceEnv, reset, run) -> None:
     """The same board and the same actions: the tilts agree to hundredths of a degree."""
-    decisions = 20
+    decisions = 5  # at most 1 s of board motion: uncontrolled robots still stand
     state = reset(jax.random.split(jax.random.PRNGKey(4), ENVS))
     scenario = jax.device_get(state.info["scenario"])
     rng = np.random.default_rng(0)

@@ -48,11 +48,11 @@ def values(learner: Learner, state: TrainState, obs: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("env", "obs", "expected"),
     [
-        (probes.OneStep(), 0.0, (1.0, 1.0)),
-        (probes.TwoSteps(), 0.0, (0.5, 0.5)),
-        (probes.TwoSteps(), 1.0, (1.0, 1.0)),
-        (probes.ChooseRight(), 0.0, (-1.0, 1.0)),
-        (probes.TimeOut(), 0.0, (2.0, 2.0)),
+        (probes.OneStep(), 1.0, (1.0, 1.0)),
+        (probes.TwoSteps(), 1.0, (0.5, 0.5)),
+        (probes.TwoSteps(), 2.0, (1.0, 1.0)),
+        (probes.ChooseRight(), 1.0, (-1.0, 1.0)),
+        (probes.TimeOut(), 1.0, (2.0, 2.0)),
         (probes.NoisyState(), 0.5, (-0.5, 0.5)),
     ],
     ids=lambda x: type(x).__name__ if isinstance(x, probes.Probe) else str(x),

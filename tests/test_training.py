@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -38,14 +37,14 @@ def start(cache: dict[str, str], *flags: str) -> subprocess.Popen[str]:
 
 
 @pytest.fixture(scope="module")
-def run(cache: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def run(cache: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     process = start(cache, *FLAGS, "--run-dir", str(folder))
     out, err = process.communicate()
     assert process.returncode == 0, out + err
     assert "Failed to import" not in out + err
-    yield folder
+    return folder
 
 
 def test_a_run_leaves_everything_behind(run: Path) -> None:
