@@ -2,7 +2,7 @@
 
 import logging
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import orbax.checkpoint as ocp
 
@@ -35,7 +35,7 @@ class Checkpoints:
     def save(self, env_steps: int, state: object) -> None:
         """Writes `state` whole or not at all; does nothing if it is already there."""
         if env_steps != self.latest:
-            self._manager.save(env_steps, args=ocp.args.StandardSave(state))  # pyright: ignore
+            self._manager.save(env_steps, args=ocp.args.StandardSave(state))
 
     def restore(self, like: T) -> T:
         """Reads the newest checkpoint.
@@ -48,8 +48,8 @@ class Checkpoints:
         """
         if self.latest is None:
             raise CheckpointError(f"no checkpoint in {self.directory}; nothing to resume")
-        args = ocp.args.StandardRestore(like)  # pyright: ignore[reportCallIssue]
-        return self._manager.restore(self.latest, args=args)
+        args = ocp.args.StandardRestore(like)
+        return cast(T, self._manager.restore(self.latest, args=args))
 
     def close(self) -> None:
         """Finishes pending work."""

@@ -261,13 +261,15 @@ def check(config: Config) -> Config:
     for section in (config, task, robot, dqn):
         for field in dataclasses.fields(section):
             value = getattr(section, field.name)
+            if value is None:
+                continue
             if isinstance(value, float) and not math.isfinite(value):
                 raise ConfigError(f"{field.name} is {value}; it must be a finite number")
             if type(field.default) is int and type(value) is not int:
                 raise ConfigError(f"{field.name} is {value!r}; it must be a whole number")
             if field.name in _NOT_NEGATIVE and value < 0:
                 raise ConfigError(f"{field.name} is {value}; it must not be negative")
-            if field.name in _POSITIVE and value is not None and not value > 0:
+            if field.name in _POSITIVE and value <= 0:
                 raise ConfigError(f"{field.name} is {value}; it must be greater than 0")
             if field.name in _UNIT and not 0 <= value <= 1:
                 raise ConfigError(f"{field.name} is {value}; it must lie between 0 and 1")

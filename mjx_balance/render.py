@@ -49,13 +49,14 @@ def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") ->
         header = {"config": to_dict(config), "camera": camera, "path": str(path.absolute())}
         header["fps"] = 1 / (stride * config.task.sim_dt)
         np.savez(job, qpos=qpos[::stride], header=json.dumps(header))
+        reason = ""
         for backend in backends:
             environment = os.environ | ({"MUJOCO_GL": backend} if backend else {})
             command = [sys.executable, "-m", "mjx_balance.render", str(job)]
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
             if done.returncode == 0:
                 return
-    reason = (done.stderr.strip().splitlines() or ["unknown reason"])[-1]
+            reason = (done.stderr.strip().splitlines() or ["unknown reason"])[-1]
     raise RenderError(
         f"offscreen rendering with {' or '.join(backends)} failed ({reason}); on Debian, "
         "install libegl1 or libosmesa6"

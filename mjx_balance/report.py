@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 RECORD_SECONDS = 100.0
 RECORD_SEED = 2_000_000
 BLUE, ORANGE, GREY = "#2166ac", "#d6604d", "#777777"
-STYLE: dict[str, Any] = {
+STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
     "savefig.dpi": 150,
     "font.size": 10,

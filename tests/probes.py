@@ -46,7 +46,7 @@ class TwoSteps(Probe):
     """Observes 1, then 2; earns nothing, then 1: q(1) = gamma, q(2) = 1."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        second = state.obs[0] - 1
+        second = jnp.asarray(state.obs)[0] - 1
         return self._next(state, 2 - second, second, terminated=second)
 
 
@@ -72,4 +72,6 @@ class NoisyState(Probe):
         return state.replace(obs=jax.random.uniform(rng, (1,), minval=-1.0))
 
     def step(self, state: State, action: jax.Array) -> State:
-        return self._next(state, 0.0, state.obs[0] * (2.0 * action - 1), terminated=1.0)
+        return self._next(
+            state, 0.0, jnp.asarray(state.obs)[0] * (2.0 * action - 1), terminated=1.0
+        )

@@ -41,7 +41,7 @@ def trained(learner: Learner, seed: int = 0) -> TrainState:
 
 
 def values(learner: Learner, state: TrainState, obs: float) -> np.ndarray:
-    return np.asarray(learner.network.apply(state.params, jnp.full(1, obs)))
+    return np.asarray(learner._q_values(state.params, jnp.full(1, obs)))
 
 
 @pytest.mark.parametrize("double", [False, True])

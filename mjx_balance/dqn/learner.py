@@ -7,15 +7,15 @@ cores, elsewhere accelerators; the program is the same.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from brax.envs.base import Env, State
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from brax.envs.base import Env, Observation, State
+from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import replay
@@ -25,14 +25,16 @@ from mjx_balance.dqn.replay import ReplayState, Transition
 AXIS = "devices"
 REPLICATED, SHARDED = PartitionSpec(), PartitionSpec(AXIS)
 
-Metrics = dict[str, jax.Array]
+Metrics: TypeAlias = dict[str, jax.Array]
+Params: TypeAlias = Any
+"""The network's variables, a flax pytree."""
 
 
 class TrainState(NamedTuple):
     """Everything a run is made of: saving it saves the run."""
 
-    params: optax.Params
-    target_params: optax.Params
+    params: Params
+    target_params: Params
     opt_state: optax.OptState
     env_state: State
     """(num_envs, ...) per leaf, sharded."""
@@ -83,7 +85,7 @@ class Learner:
         config: DQNConfig,
         num_envs: int,
         num_env_steps: int,
-        devices: Sequence[jax.Device] | None = None,
+        devices: Sequence[Any] | None = None,
     ):
         """Sets the programs up; nothing is compiled yet.
 
@@ -110,21 +112,10 @@ class Learner:
         self.optimizer = make_optimizer(config, self.iterations * config.updates_per_step)
         self.mesh = Mesh(np.asarray(devices), (AXIS,), axis_types=(AxisType.Auto,))
         self.trace_count = 0
-        self.specs = TrainState(
-            params=REPLICATED,
-            target_params=REPLICATED,
-            opt_state=REPLICATED,
-            env_state=SHARDED,  # pyright: ignore[reportArgumentType]
-            replay=ReplayState(SHARDED, REPLICATED, REPLICATED),  # pyright: ignore
-            env_steps=REPLICATED,  # pyright: ignore[reportArgumentType]
-            gradient_steps=REPLICATED,  # pyright: ignore[reportArgumentType]
-            key=REPLICATED,  # pyright: ignore[reportArgumentType]
-        )
-        self.shardings = jax.tree.map(
-            lambda spec: NamedSharding(self.mesh, spec),
-            self.specs,
-            is_leaf=lambda x: isinstance(x, PartitionSpec),
-        )
+        specs: dict[str, Any] = dict.fromkeys(TrainState._fields, REPLICATED)
+        replay_specs: list[Any] = [SHARDED, REPLICATED, REPLICATED]
+        specs |= {"env_state": SHARDED, "replay": ReplayState(*replay_specs)}
+        self.specs = TrainState(**specs)
 
     def init(self, seed: int) -> TrainState:
         """Builds the state of a new run, on its devices."""
@@ -160,7 +151,7 @@ class Learner:
         key, key_params, key_env = jax.random.split(key, 3)
         local_envs = self.num_envs // self.num_devices
         env_state = self._reset(self._device_key(key_env), local_envs)
-        obs = env_state.obs[0]  # pyright: ignore[reportIndexIssue]
+        obs = _array(env_state.obs)[0]
         params = self.network.init(key_params, obs)
         scalar = jnp.float32(0.0)
         example = Transition(obs, jnp.int32(0), scalar, scalar, obs)
@@ -207,17 +198,17 @@ class Learner:
         """Steps this device's envs once and resets those that are done."""
         before = state.env_state
         count = before.reward.shape[0]
-        q_values = self.network.apply(state.params, before.obs)
+        q_values = self._q_values(state.params, _array(before.obs))
         keys = jax.random.split(self._device_key(key_act), count)
         action = jax.vmap(epsilon_greedy, (0, 0, None))(keys, q_values, rate)
         after = jax.vmap(self.env.step)(before, action)
         truncation = after.info.get("truncation", jnp.zeros_like(after.done))
         transition = Transition(
-            obs=before.obs,  # pyright: ignore[reportArgumentType]
+            obs=_array(before.obs),
             action=action,
             reward=after.reward,
             terminated=after.done * (1 - truncation),
-            next_obs=after.obs,  # pyright: ignore[reportArgumentType]
+            next_obs=_array(after.obs),
         )
         metrics = jax.tree.map(jnp.mean, after.metrics | {"reward": after.reward})
         env_state = self.reset_done(after, self._device_key(key_reset))
@@ -252,18 +243,21 @@ class Learner:
         )
         return state, loss
 
-    def _loss(
-        self, params: optax.Params, target_params: optax.Params, batch: Transition
-    ) -> jax.Array:
+    def _loss(self, params: Params, target_params: Params, batch: Transition) -> jax.Array:
         """Mean squared TD error (paper Eq. 1)."""
-        q_tm1 = self.network.apply(params, batch.obs)
-        q_t = self.network.apply(target_params, batch.next_obs)
+        q_tm1 = self._q_values(params, batch.obs)
+        q_t = self._q_values(target_params, batch.next_obs)
         discount_t = self.config.gamma * (1 - batch.terminated)
-        selector = self.network.apply(params, batch.next_obs) if self.config.double else None
+        selector = self._q_values(params, batch.next_obs) if self.config.double else None
         error = jax.vmap(td_error, (0, 0, 0, 0, 0, None if selector is None else 0))(
             q_tm1, batch.action, batch.reward, discount_t, q_t, selector
         )
         return jnp.mean(error**2)
+
+    def _q_values(self, params: Params, obs: jax.Array) -> jax.Array:
+        values = self.network.apply(params, obs)
+        assert isinstance(values, jax.Array)
+        return values
 
     def _reset(self, key: jax.Array, count: int) -> State:
         return jax.vmap(self.env.reset)(jax.random.split(key, count))
@@ -271,3 +265,10 @@ class Learner:
     def _device_key(self, key: jax.Array) -> jax.Array:
         """A different key on every device."""
         return jax.random.fold_in(key, jax.lax.axis_index(AXIS))
+
+
+def _array(obs: Observation) -> jax.Array:
+    """Brax allows dictionaries of observations; this learner takes arrays."""
+    if not isinstance(obs, jax.Array):
+        raise TypeError(f"the env observes {type(obs).__name__}; this learner takes arrays")
+    return obs
