@@ -1,0 +1,87 @@
+"""What the contact model and the solver's accuracy do to the robot. Plain MuJoCo, no JAX.
+
+A policy, with every tenth action random as in training, stands on the boards of suite
+`corner` under other solver settings. Prints falls, tilt, and how far feet creep.
+
+    python benchmarks/contact.py POLICY [--scenarios 32] [--duration 60]
+"""
+
+import argparse
+import copy
+import dataclasses
+
+import numpy as np
+
+from mjx_balance import evaluation, load_policy
+from mjx_balance.policy import Policy
+from mjx_balance.scene import Scene
+
+LINE_SEARCH_ITERATIONS = 6  # as in training
+VARIANTS: dict[str, dict[str, float]] = {
+    "as shipped": {},
+    "1 Newton iteration": {"iterations": 1},
+    "2 Newton iterations": {"iterations": 2},
+    "4 Newton iterations": {"iterations": 4},
+    "impratio 1, contact time 20 ms": {"impratio": 1.0, "contact_time": 0.02},
+}
+
+
+def varied(scene: Scene, changes: dict[str, float]) -> Scene:
+    """A copy of the scene with other solver settings."""
+    changed = copy.copy(scene.model)
+    if "iterations" in changes:
+        changed.opt.iterations = int(changes["iterations"])
+        changed.opt.ls_iterations = LINE_SEARCH_ITERATIONS
+    if "impratio" in changes:
+        changed.opt.impratio = changes["impratio"]
+    if "contact_time" in changes:
+        changed.pair_solref[:, 0] = changes["contact_time"]
+    return dataclasses.replace(scene, model=changed)
+
+
+def exploring(policy: Policy, share: float, seed: int) -> evaluation.Controller:
+    """The policy, with a share of its actions random."""
+    rng = np.random.default_rng(seed)
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        random = rng.integers(len(policy.actions), size=len(obs))
+        return np.where(rng.uniform(size=len(obs)) < share, random, policy(obs))
+
+    return act
+
+
+def main() -> None:
+    """Runs every variant and prints a table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("policy")
+    parser.add_argument("--scenarios", type=int, default=32)
+    parser.add_argument("--duration", type=float, default=60.0)
+    args = parser.parse_args()
+    policy = load_policy(args.policy)
+    scene = evaluation.policy_scene(policy)
+    config = policy.config
+    drawn = evaluation.make_scenarios(config, "corner", args.scenarios, args.duration, 0)
+    print("| variant | falls | mean tilt deg | max deg | creep of the standing robots, cm |")
+    print("|---|---|---|---|---|")
+    trunk = scene.trunk_quat[0] - np.asarray((3, 2))
+    for name, changes in VARIANTS.items():
+        rollout = evaluation.roll_out(
+            varied(scene, changes),
+            config,
+            exploring(policy, 0.1, 0),
+            drawn,
+            args.duration,
+            record=True,
+        )
+        assert rollout.qpos is not None
+        end = rollout.qpos[~rollout.fell, -1][:, trunk]
+        creep = f"{100 * np.linalg.norm(end, axis=-1).mean():.1f}" if len(end) else "-"
+        print(
+            f"| {name} | {rollout.fell.sum()} of {len(rollout.fell)} | {rollout.tilt.mean():.3f} "
+            f"| {rollout.tilt.max():.2f} | {creep} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
