@@ -6,6 +6,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -149,10 +150,13 @@ def roll_pitch(quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
     """A table for people: one row per suite."""
-    table = Table(title="plain MuJoCo, tilt in deg over every physics step", title_justify="left")
-    table.add_column("suite", style="bold")
+    title = "plain MuJoCo, tilt in deg over every physics step"
+    table = Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
+    )
+    table.add_column("suite", style="bold", no_wrap=True)
     shown = ("mean", "p50", "p95", "p99", "max")
-    for name in ("scenarios", "falls", *shown, "action mm"):
+    for name in ("scenarios", "falls", *shown, "act mm"):
         table.add_column(name, justify="right", no_wrap=True)
     for suite, result in results.items():
         tilt = result["tilt_deg"]
@@ -171,7 +175,6 @@ def print_summary(
 ) -> None:
     """Says how the run went and where everything is."""
     console.print(evaluation_table(results))
-    places = Table.grid(padding=(0, 2))
     for name, what in (
         ("policy.safetensors", "the policy; `mjx-balance evaluate` runs it"),
         ("evaluation.json", "the table above"),
@@ -179,8 +182,7 @@ def print_summary(
         ("metrics.jsonl", "every logged number; tensorboard/ has them too"),
         ("checkpoints/", "the whole training state"),
     ):
-        places.add_row(str(run_dir / name), f"[dim]{what}[/dim]")
-    console.print(places)
+        console.print(f"{run_dir / name}  [dim]{what}[/dim]", highlight=False, soft_wrap=True)
     console.print(f"done in {seconds:.0f} s", highlight=False)
 
 
