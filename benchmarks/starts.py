@@ -1,7 +1,7 @@
 """Does training always start, and how soon does it learn?
 
-Starts the same training several times in a row, waits for its first metrics, then
-stops it. Prints the seconds to the first line of metrics, of which the first start
+Starts the same training several times in a row, waits until it has logged its first
+gradient steps, then stops it. Prints the seconds that took, of which the first start
 includes the compilation, and the peak memory. A start that takes longer than the
 limit counts as hung.
 
@@ -9,6 +9,7 @@ limit counts as hung.
 """
 
 import argparse
+import json
 import os
 import resource
 import subprocess
@@ -22,8 +23,8 @@ REPO = Path(__file__).resolve().parent.parent
 
 
 def start(folder: Path, num_envs: int, cache: str) -> float | None:
-    """Seconds until a new run has logged its first metrics; None if it never does."""
-    flags = f"--num-envs {num_envs} --min-replay-size 1024 --log-every 1024".split()
+    """Seconds until a new run has logged its first gradient steps; None if it never does."""
+    flags = f"--num-envs {num_envs} --log-every 1024".split()
     process = subprocess.Popen(
         [sys.executable, str(REPO / "train.py"), *flags, "--run-dir", str(folder)],
         env=os.environ | {"MJX_BALANCE_CACHE": cache},
@@ -33,7 +34,8 @@ def start(folder: Path, num_envs: int, cache: str) -> float | None:
     metrics = folder / "metrics.jsonl"
     try:
         while time.perf_counter() - began < LIMIT_S and process.poll() is None:
-            if metrics.is_file() and metrics.read_text().count("\n") >= 1:
+            lines = metrics.read_text().splitlines(keepends=True) if metrics.is_file() else []
+            if any(json.loads(x)["gradient_steps"] for x in lines if x.endswith("\n")):
                 return time.perf_counter() - began
             time.sleep(0.05)
         return None

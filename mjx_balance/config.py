@@ -223,6 +223,7 @@ PRESETS: Mapping[str, Config] = {
             learning_rate_end=1e-5,
             batch_size=512,
             updates_per_step=8,
+            min_replay_size=2_048,
             epsilon_decay_steps=40_000,
             head="factored",
         ),
