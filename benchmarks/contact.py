@@ -13,8 +13,10 @@ import dataclasses
 import numpy as np
 
 from mjx_balance import evaluation, load_policy
+from mjx_balance.plant import View
 from mjx_balance.policy import Policy
 from mjx_balance.scene import Scene
+from mjx_balance.suites import make_scenarios
 
 LINE_SEARCH_ITERATIONS = 6  # as in training
 VARIANTS: dict[str, dict[str, float]] = {
@@ -43,9 +45,9 @@ def exploring(policy: Policy, share: float, seed: int) -> evaluation.Controller:
     """The policy, with a share of its actions random."""
     rng = np.random.default_rng(seed)
 
-    def act(obs: np.ndarray) -> np.ndarray:
-        random = rng.integers(len(policy.actions), size=len(obs))
-        return np.where(rng.uniform(size=len(obs)) < share, random, policy(obs))
+    def act(view: View) -> np.ndarray:
+        random = rng.integers(len(policy.actions), size=len(view.ids))
+        return np.where(rng.uniform(size=len(view.ids)) < share, random, policy(view.obs))
 
     return act
 
@@ -60,7 +62,7 @@ def main() -> None:
     policy = load_policy(args.policy)
     scene = evaluation.policy_scene(policy)
     config = policy.config
-    drawn = evaluation.make_scenarios(config, "corner", args.scenarios, args.duration, 0)
+    drawn, _ = make_scenarios(config, "corner", args.scenarios, args.duration, 0)
     print("| variant | falls | mean tilt deg | max deg | creep of the standing robots, cm |")
     print("|---|---|---|---|---|")
     trunk = scene.trunk_quat[0] - np.asarray((3, 2))

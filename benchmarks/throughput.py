@@ -134,7 +134,8 @@ def _peer(env, num_envs: int) -> tuple[Callable[[], Any], int]:
     before = np.tile(standing_heights(config), (num_envs, 1))
     change = action_table(config.task)[rng.integers(env.action_size, size=num_envs)]
     after = apply_action(config.task, config.robot, before, change)
-    scenario = Scenario(rng.uniform(-5, 5, (num_envs, 2, 2)), np.zeros(num_envs))
+    targets = rng.uniform(-5, 5, (num_envs, 2, 2))
+    scenario = Scenario(targets, np.zeros(num_envs), np.full(num_envs, config.task.board_rate))
     ctrl = decision_ctrl(config, scene, scenario, np.zeros(num_envs), before, after)
     batch = Batch(scene.model, num_envs, os.cpu_count() or 1)
     repeats = max(1, DECISIONS_PER_CALL // num_envs)

@@ -1,4 +1,4 @@
-"""The command line: `mjx-balance train` and `mjx-balance evaluate`."""
+"""The command line: `mjx-balance train`, `evaluate` and `report`."""
 
 import argparse
 import dataclasses
@@ -17,7 +17,7 @@ from mjx_balance.quiet import quiet_imports
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
-COMMANDS = ("train", "evaluate")
+COMMANDS = ("train", "evaluate", "report")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +35,12 @@ class TrainArgs:
 class EvaluateArgs:
     """Evaluate an exported policy in plain MuJoCo on all cores. Needs no JAX."""
 
-    policy: Annotated[Path, tyro.conf.Positional]
+    policy: Annotated[Path | None, tyro.conf.Positional] = None
     """Policy file."""
+    controller: str | None = None
+    """Baseline to evaluate instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     suite: str = "paper"
-    """Kind of tilt scenarios: paper or corner."""
+    """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, fast, steep."""
     scenarios: int = 256
     """How many of them."""
     duration: float = 60.0
@@ -51,16 +53,28 @@ class EvaluateArgs:
     """MP4 to write of the first scenario."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ReportArgs:
+    """Write one HTML page about runs: tables, curves, envelope, video. Needs no JAX."""
+
+    run_dirs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Run folders; the first with a policy is shown beside the baselines."""
+    out: Path | None = None
+    """File to write; none: report.html in the first folder."""
+    scenarios: int = 64
+    """Scenarios per suite and controller."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns its exit code, 2 for input that cannot be used."""
     argv = list(sys.argv[1:] if arguments is None else arguments)
     if not argv or argv[0] not in COMMANDS:
         wants_help = bool(argv) and argv[0] in ("-h", "--help")
-        print("usage: mjx-balance {train,evaluate} ... (--help after either lists its flags)")
+        print("usage: mjx-balance {train,evaluate,report} ... (--help after one lists its flags)")
         if argv and not wants_help:
             _complain(f"unknown command {argv[0]!r}; known commands: {', '.join(COMMANDS)}")
         return 0 if wants_help else USAGE_ERROR
-    return {"train": _train, "evaluate": _evaluate}[argv[0]](argv[1:])
+    return {"train": _train, "evaluate": _evaluate, "report": _report}[argv[0]](argv[1:])
 
 
 def _train(argv: list[str]) -> int:
@@ -102,26 +116,47 @@ def _train(argv: list[str]) -> int:
 def _evaluate(argv: list[str]) -> int:
     args = tyro.cli(EvaluateArgs, args=argv, prog="mjx-balance evaluate")
     from mjx_balance import evaluation, report
+    from mjx_balance.baselines import ControllerError, make_controller
     from mjx_balance.display import Display
+    from mjx_balance.scene import load_scene
+    from mjx_balance.suites import SuiteError
 
     display = Display(Console(stderr=True))
     try:
         for path in (args.json, args.video):
             if path is not None and not path.absolute().parent.is_dir():
                 return _complain(f"cannot write {path}: its folder does not exist")
-        policy = load_policy(args.policy)
+        if (args.policy is None) == (args.controller is None):
+            return _complain("name a policy file or --controller NAME, one of the two")
+        if args.policy is not None:
+            policy = load_policy(args.policy)
+            config, scene = policy.config, evaluation.policy_scene(policy)
+            controller = evaluation.observing(policy)
+        else:
+            assert args.controller is not None
+            config = preset("default")
+            scene = load_scene(config)
+            controller = make_controller(args.controller, scene, config)
         with display.bar(f"evaluating, suite {args.suite}") as bar:
-            result = evaluation.evaluate(
-                policy, args.suite, args.scenarios, args.duration, args.seed, bar
+            rollout = evaluation.run_suite(
+                scene,
+                config,
+                controller,
+                args.suite,
+                args.scenarios,
+                args.duration,
+                args.seed,
+                bar,
             )
+        result = evaluation.summarize(rollout, args.suite, args.duration, args.seed)
         if args.json:
             args.json.write_text(json.dumps(result, indent=2) + "\n")
         Console().print(report.evaluation_table({args.suite: result}))
         speed = result["physics_steps_per_second"]
         print(f"{speed:,.0f} physics steps per second")
         if args.video:
-            return _video(policy, args)
-    except (PolicyError, evaluation.EvaluationError) as error:
+            return _video(scene, config, controller, args)
+    except (PolicyError, evaluation.EvaluationError, SuiteError, ControllerError) as error:
         return _complain(str(error))
     except OSError as error:
         return _complain(f"cannot write {error.filename}: {error.strerror}")
@@ -130,17 +165,44 @@ def _evaluate(argv: list[str]) -> int:
     return 0
 
 
-def _video(policy, args: EvaluateArgs) -> int:
-    from mjx_balance import render, report
+def _video(scene, config: Config, controller, args: EvaluateArgs) -> int:
+    from mjx_balance import evaluation, render
 
     assert args.video is not None
-    config, qpos = report.record(policy, args.suite, args.duration, args.seed)
+    rollout = evaluation.run_suite(
+        scene, config, controller, args.suite, 1, args.duration, args.seed, record=True
+    )
+    assert rollout.qpos is not None
     try:
-        render.write(args.video, config, qpos)
+        render.write(args.video, config, rollout.qpos[0])
     except render.RenderError as error:
         print(f"mjx-balance: no video written: {error}", file=sys.stderr)
         return 1
     print(f"video of the first scenario: {args.video}")
+    return 0
+
+
+def _report(argv: list[str]) -> int:
+    args = tyro.cli(ReportArgs, args=argv, prog="mjx-balance report")
+    from mjx_balance import report
+    from mjx_balance.display import Display
+    from mjx_balance.evaluation import EvaluationError
+
+    if not args.run_dirs:
+        return _complain("name at least one run folder")
+    out = args.out or args.run_dirs[0] / "report.html"
+    display = Display(Console(stderr=True))
+    try:
+        missing = report.write_report(args.run_dirs, out, args.scenarios, display.bar)
+    except (report.ReportError, EvaluationError) as error:
+        return _complain(str(error))
+    except OSError as error:
+        return _complain(f"cannot write {error.filename}: {error.strerror}")
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    for sentence in missing:
+        print(f"mjx-balance: {sentence}", file=sys.stderr)
+    print(out)
     return 0
 
 

@@ -18,7 +18,8 @@ T = TypeVar("T")
 
 ACTION_AXES = 2  # roll and pitch, paper Eq. 3
 LEGS = ("LF", "RF", "LH", "RH")
-HEADS = ("joint", "factored")
+HEADS = ("joint", "factored", "radial")
+REWARD_TILTS = ("end", "mean")
 
 
 class ConfigError(ValueError):
@@ -103,9 +104,9 @@ class TaskConfig:
     """Greatest height change of one decision on one axis, m (paper Eq. 3)."""
     action_levels: int = 21
     """Height changes per axis (paper Eq. 3: n = 0..20)."""
-    action_ramp: float = 0.4
+    action_ramp: float = 0.2
     """Share of a decision in which the legs reach their new heights (chosen: the gyro then
-    reads the board's own rate before the next decision)."""
+    reads the board's own rate before the next decision; benchmarks/README.md)."""
     gyro_lags: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     """Gyro samples in the observation, physics steps back (paper Eq. 2)."""
     accel_lags: tuple[int, ...] = (0, 2, 4, 6, 8, 10, 12, 14, 15)
@@ -116,6 +117,9 @@ class TaskConfig:
     """Angular rate that enters the network as 1, rad/s (chosen: 1 deg/s)."""
     accel_scale: float = 9.81 * math.sin(math.radians(1.0))
     """Acceleration that enters the network as 1, m/s^2 (chosen: 1 deg of tilt)."""
+    reward_tilt: Literal["end", "mean"] = "end"
+    """Tilt that is rewarded: at the decision's end (paper 3.2: in the new state), or the mean
+    over its physics steps."""
     reward_level: float = 0.4
     """Reward for a level body (paper Eq. 4)."""
     reward_sharpness: float = 1.5
@@ -151,6 +155,37 @@ class TaskConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class RandomConfig:
+    """What differs from world to world; off by default, as in the paper.
+
+    Used twice: as domain randomisation in training, and to define the evaluation suites.
+    """
+
+    gyro_noise: float = 0.0
+    """Standard deviation of every gyro sample, rad/s."""
+    accel_noise: float = 0.0
+    """Standard deviation of every accelerometer sample, m/s^2."""
+    payload: float = 0.0
+    """Greatest mass carried on the trunk, kg."""
+    payload_offset: float = 0.05
+    """Greatest distance of the payload from the trunk's centre on either axis, m (chosen)."""
+    payload_height: float = 0.08
+    """Height of the payload above the trunk's centre, m (chosen)."""
+    friction_min: float | None = None
+    """Least sliding friction of the feet; none: foot_friction."""
+    friction_max: float | None = None
+    """Greatest sliding friction of the feet; none: foot_friction."""
+    gain_spread: float = 0.0
+    """Servo gains differ by up to this share."""
+    latency_share: float = 0.0
+    """Share of the worlds that take every action one decision late."""
+    rate_max: float | None = None
+    """Board speeds are uniform from board_rate to this, deg/s; none: board_rate."""
+    incline_max: float | None = None
+    """Inclines are uniform from max_incline to this, deg; none: max_incline."""
+
+
+@dataclasses.dataclass(frozen=True)
 class DQNConfig:
     """The learner (paper sections 2 and 3.2); it knows nothing of the robot."""
 
@@ -176,10 +211,20 @@ class DQNConfig:
     """Share of random actions after the decay (chosen)."""
     epsilon_decay_steps: int = 50_000
     """Env steps over which epsilon falls linearly (chosen)."""
+    dither: int = 0
+    """Levels by which every training action is moved at random on each axis (chosen: none)."""
     hidden_sizes: tuple[int, ...] = (256, 256)
     """Widths of the Q-network's hidden layers (chosen)."""
-    head: Literal["joint", "factored"] = "joint"
-    """One output per action, or one per level and axis, added up."""
+    head: Literal["joint", "factored", "radial"] = "joint"
+    """How the network makes action values (dqn/networks.py): one output per action, one per
+    level and axis, added up, or a best action and a profile around it."""
+    whiten_steps: int = 0
+    """Env steps in which the inputs' covariance is gathered, to whiten them by; 0: inputs are
+    taken as they are (paper)."""
+    whiten_floor: float = 1e-3
+    """Variance added to every direction, so that none is blown up beyond measure (chosen)."""
+    mirror: bool = False
+    """Learn from reflections of the transitions too (task/symmetry.py; paper: none)."""
     double: bool = False
     """Double DQN (van Hasselt et al. 2015) instead of Eq. 1's max over the target network."""
     max_grad_norm: float = 10.0
@@ -196,8 +241,10 @@ class Config:
     """Seed of everything random."""
     num_envs: int | None = None
     """Boards simulated at once; none: sized to the device."""
+    num_seeds: int = 1
+    """Runs trained at once in one program, with seeds `seed`, `seed + 1`, ..."""
     num_env_steps: int = 200_000
-    """Decisions of the run, over all boards (paper 4: about 200k)."""
+    """Decisions of a run, over all boards (paper 4: about 200k)."""
     num_devices: int | None = None
     """JAX devices to spread the boards over; none: one per CPU core, or all accelerators."""
     log_every: int = 2_048
@@ -210,6 +257,7 @@ class Config:
     """Length of each of them, s."""
     task: TaskConfig = dataclasses.field(default_factory=TaskConfig)
     robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
+    random: RandomConfig = dataclasses.field(default_factory=RandomConfig)
     dqn: DQNConfig = dataclasses.field(default_factory=DQNConfig)
 
 
@@ -217,15 +265,21 @@ PRESETS: Mapping[str, Config] = {
     "paper": Config(preset="paper"),
     "default": Config(
         preset="default",
-        task=TaskConfig(square_share=0.5),
+        task=TaskConfig(
+            square_share=0.5, reward_tilt="mean", reward_toward=1.0, reward_toward_scale=2.5
+        ),
         dqn=DQNConfig(
-            learning_rate=1e-3,
+            learning_rate=3e-3,
             learning_rate_end=1e-5,
             batch_size=512,
-            updates_per_step=8,
+            updates_per_step=32,
             min_replay_size=2_048,
-            epsilon_decay_steps=40_000,
-            head="factored",
+            epsilon_decay_steps=10_000,
+            dither=3,
+            hidden_sizes=(64, 64),
+            head="radial",
+            mirror=True,
+            whiten_steps=50_000,
         ),
     ),
     "smoke": Config(
@@ -235,14 +289,19 @@ PRESETS: Mapping[str, Config] = {
         log_every=1_024,
         eval_scenarios=16,
         eval_duration=20.0,
+        task=TaskConfig(reward_tilt="mean", reward_toward=1.0, reward_toward_scale=2.5),
         dqn=DQNConfig(
-            learning_rate=1e-3,
+            learning_rate=3e-3,
             batch_size=256,
-            updates_per_step=4,
+            updates_per_step=8,
             min_replay_size=512,
             replay_capacity=8_192,
             epsilon_decay_steps=4_096,
-            head="factored",
+            dither=3,
+            hidden_sizes=(64, 64),
+            head="radial",
+            mirror=True,
+            whiten_steps=2_048,
         ),
     ),
 }
@@ -258,8 +317,8 @@ def preset(name: str) -> Config:
 
 def check(config: Config) -> Config:
     """Returns `config` if it can be run; raises `ConfigError` with one sentence if not."""
-    task, robot, dqn = config.task, config.robot, config.dqn
-    for section in (config, task, robot, dqn):
+    task, robot, random, dqn = config.task, config.robot, config.random, config.dqn
+    for section in (config, task, robot, random, dqn):
         for field in dataclasses.fields(section):
             value = getattr(section, field.name)
             if value is None:
@@ -278,6 +337,10 @@ def check(config: Config) -> Config:
         preset(config.preset)
     if sorted(robot.legs) != sorted(LEGS):
         raise ConfigError(f"legs is {robot.legs}; it must name each of {', '.join(LEGS)} once")
+    if task.reward_tilt not in REWARD_TILTS:
+        raise ConfigError(
+            f"reward_tilt is {task.reward_tilt!r}; it must be one of {', '.join(REWARD_TILTS)}"
+        )
     if dqn.head not in HEADS:
         raise ConfigError(f"head is {dqn.head!r}; it must be one of {', '.join(HEADS)}")
     steps = task.ctrl_dt / task.sim_dt
@@ -341,11 +404,17 @@ _POSITIVE = frozenset(
     "sim_dt ctrl_dt body_height max_incline board_rate target_period action_max height_scale "
     "gyro_scale accel_scale reward_toward_scale episode_length learning_rate batch_size "
     "updates_per_step replay_capacity min_replay_size target_update_period epsilon_decay_steps "
-    "max_grad_norm num_envs num_env_steps num_devices log_every checkpoint_every eval_scenarios "
-    "eval_duration foot_friction servo_stiffness hip_x hip_y thigh calf foot_radius".split()
+    "max_grad_norm whiten_floor num_envs num_seeds num_env_steps num_devices log_every "
+    "checkpoint_every eval_scenarios eval_duration friction_min friction_max foot_friction "
+    "servo_stiffness hip_x hip_y thigh calf foot_radius".split()
 )
-_NOT_NEGATIVE = frozenset(("seed", "learning_rate_end", "reward_sharpness"))
-_UNIT = frozenset(("action_ramp", "square_share", "gamma", "epsilon_start", "epsilon_end"))
+_NOT_NEGATIVE = frozenset(
+    "seed learning_rate_end reward_sharpness gyro_noise accel_noise payload payload_offset "
+    "dither whiten_steps".split()
+)
+_UNIT = frozenset(
+    "gain_spread latency_share action_ramp square_share gamma epsilon_start epsilon_end".split()
+)
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -374,4 +443,4 @@ def from_dict(kind: type[T], values: Mapping[str, Any]) -> T:
     return kind(**built)
 
 
-_SECTIONS = {"task": TaskConfig, "robot": RobotConfig, "dqn": DQNConfig}
+_SECTIONS = {"task": TaskConfig, "robot": RobotConfig, "random": RandomConfig, "dqn": DQNConfig}

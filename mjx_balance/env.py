@@ -1,19 +1,23 @@
 """`BalanceEnv`: one robot on one board, a brax environment with 441 discrete actions."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State
 
 from mjx_balance import physics
-from mjx_balance.config import ACTION_AXES, Config, check, preset
+from mjx_balance.config import ACTION_AXES, Config, RandomConfig, check, preset
 from mjx_balance.plant import decision_ctrl, observation, standing_heights
-from mjx_balance.scene import Scene, load_scene
+from mjx_balance.scene import Scene, load_scene, model_fields
 from mjx_balance.task import tilt
-from mjx_balance.task.actions import action_table, apply_action
+from mjx_balance.task.actions import action_table, apply_action, nearest_action
+from mjx_balance.task.conditions import DRAWS, draw_conditions
 from mjx_balance.task.observation import extend_history, observation_names
 from mjx_balance.task.reward import failed, reward_terms
+from mjx_balance.task.symmetry import Symmetries, symmetries
 
 
 class BalanceEnv(Env):
@@ -39,6 +43,7 @@ class BalanceEnv(Env):
         self.config = check(config or preset("default"))
         self.scene: Scene = load_scene(self.config)
         self._table = action_table(self.config.task)
+        self._randomised = self.config.random != RandomConfig()
 
     @functools.cached_property
     def _advance(self) -> physics.Advance:
@@ -59,6 +64,11 @@ class BalanceEnv(Env):
         return (self.config.task.action_levels,) * ACTION_AXES
 
     @property
+    def symmetries(self) -> Symmetries:
+        """How observations and actions look in a mirror."""
+        return symmetries(self.config.task, self.config.robot)
+
+    @property
     def backend(self) -> str:
         return "mjx"
 
@@ -72,6 +82,7 @@ class BalanceEnv(Env):
           State with obs (obs_size,).
         """
         task = self.config.task
+        rng, key_conditions, key_noise = jax.random.split(rng, 3)
         state = physics.initial_state(self.scene)
         still = jnp.asarray(self.scene.stance.imu, jnp.float32)
         info = {
@@ -82,6 +93,13 @@ class BalanceEnv(Env):
             "decision": jnp.int32(0),
             "truncation": jnp.float32(0.0),
         }
+        if self._randomised:
+            uniform = jax.random.uniform(key_conditions, (DRAWS,))
+            info |= {
+                "conditions": draw_conditions(self.config.random, self.config.robot, uniform),
+                "pending": jnp.int32(nearest_action(task, np.zeros(ACTION_AXES))),
+                "noise_key": key_noise,
+            }
         metrics = {
             name: jnp.float32(0.0)
             for name in ("tilt_deg", "fall", "reward_level", "reward_toward", "reward_fail")
@@ -100,22 +118,35 @@ class BalanceEnv(Env):
         Returns:
           The state `ctrl_dt` later.
         """
-        config, task, info = self.config, self.config.task, state.info
+        config, task = self.config, self.config.task
+        info: dict[str, Any] = state.info
+        fields: dict[str, jax.Array] = {}
+        if self._randomised:
+            late = info["conditions"].latency > 0
+            chosen, action = action, jnp.where(late, info["pending"], action)  # pyright: ignore
+            info = info | {"pending": chosen.astype(jnp.int32)}
+            fields = model_fields(self.scene, info["conditions"])
         change = jnp.asarray(self._table)[action]
         heights = apply_action(task, config.robot, info["heights"], change)
         decision = info["decision"]
         ctrl = decision_ctrl(
             config, self.scene, info["scenario"], decision, info["heights"], heights
         )
-        moved, motion = self._advance(state.pipeline_state, ctrl)  # pyright: ignore
+        moved, motion = self._advance(state.pipeline_state, ctrl, fields)  # pyright: ignore
 
         fell = failed(task, motion.tilt).any()
         truncated = ~fell & (decision + 1 >= task.episode_length)
         # A diverged world has fallen; what is not a number must not reach the learner.
         moved, motion = jax.tree.map(jnp.nan_to_num, (moved, motion))
-        after = motion.tilt[-1]
+        after = motion.tilt.mean() if task.reward_tilt == "mean" else motion.tilt[-1]
         terms = reward_terms(task, info["tilt"], after, fell.astype(after.dtype))
-        imu = extend_history(info["imu"], motion.imu)
+        samples = motion.imu
+        if self._randomised:
+            key, key_noise = jax.random.split(info["noise_key"])
+            noise = jax.random.normal(key_noise, samples.shape)
+            samples = samples + info["conditions"].imu_noise * noise
+            info = info | {"noise_key": key}
+        imu = extend_history(info["imu"], samples)
         metrics = {
             "tilt_deg": motion.tilt.mean(),
             "fall": fell.astype(jnp.float32),
@@ -144,12 +175,21 @@ class BalanceEnv(Env):
         """
         task = self.config.task
         count = tilt.num_targets(task, task.episode_length * task.ctrl_dt)
-        key_disc, key_square, key_which, key_phase = jax.random.split(key, 4)
-        disc = tilt.disc_targets(task, *jax.random.uniform(key_disc, (2, count)))
-        limit = task.max_incline
-        square = jax.random.uniform(key_square, (count, 2), minval=-limit, maxval=limit)
+        key_disc, key_square, key_which, key_phase, key_size = jax.random.split(key, 5)
+        share = jax.random.uniform(key_size, (2,))
+        random = self.config.random
+        limit = _between(task.max_incline, random.incline_max, share[0])
+        rate = _between(task.board_rate, random.rate_max, share[1])
+        disc = tilt.disc_targets(limit, *jax.random.uniform(key_disc, (2, count)))
+        square = limit * jax.random.uniform(key_square, (count, 2), minval=-1.0)
         in_square = jax.random.bernoulli(key_which, task.square_share, (count, 1))
         targets = jnp.where(in_square, square, disc)
         # The board starts level, so the first target is one it has already reached.
         targets = targets.at[0].set(0.0)
-        return tilt.Scenario(targets, jax.random.uniform(key_phase) * task.target_period)
+        phase = jax.random.uniform(key_phase) * task.target_period
+        return tilt.Scenario(targets, phase, rate)
+
+
+def _between(least: float, most: float | None, share: jax.Array) -> jax.Array:
+    """A share of the way from `least` to `most`; `least` if there is no `most`."""
+    return jnp.float32(least) + (0.0 if most is None else most - least) * share

@@ -1,4 +1,4 @@
-"""Suites of tilt scenarios rolled out in plain MuJoCo on all cores. No JAX.
+"""Controllers rolled out in plain MuJoCo on all cores. No JAX.
 
 The engine runs as MuJoCo ships it: C, float64, default solver accuracy. From a fall
 to the scenario's end the tilt counts as `fail_tilt`, so falling never helps; a
@@ -14,56 +14,31 @@ from typing import Any
 import numpy as np
 from mujoco.batch import Batch
 
-from mjx_balance.config import Config
-from mjx_balance.plant import decision_ctrl, observation, standing_heights
+from mjx_balance.config import Config, RandomConfig
+from mjx_balance.plant import View, decision_ctrl, observation, standing_heights
 from mjx_balance.policy import Policy, PolicyError
-from mjx_balance.scene import Scene, load_scene
+from mjx_balance.scene import Scene, load_scene, model_fields
+from mjx_balance.suites import authority, find_suite, make_scenarios, reach
 from mjx_balance.task import tilt
-from mjx_balance.task.actions import action_table, apply_action
+from mjx_balance.task.actions import action_table, apply_action, nearest_action
+from mjx_balance.task.conditions import Conditions
 from mjx_balance.task.observation import extend_history
 from mjx_balance.task.reward import body_tilt, failed
 
-Controller = Callable[[np.ndarray], np.ndarray]
-"""Maps observations (batch, obs_size) to action indices (batch,)."""
+Controller = Callable[[View], np.ndarray]
+"""Maps what there is to see of n worlds to action indices (n,)."""
+
+SETTLED_SECONDS = 3.0
+"""End of every target's period in which the board has long been at rest, s."""
 
 
 class EvaluationError(ValueError):
     """An evaluation that cannot be run; the message says why."""
 
 
-def _paper_targets(config: Config, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """Direction uniform, total tilt uniform up to max_incline (paper 3.1)."""
-    return tilt.disc_targets(config.task, rng.uniform(size=shape), rng.uniform(size=shape))
-
-
-def _corner_targets(config: Config, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """Both axes at full incline at once, signs at random: the paper's declared weakness."""
-    return config.task.max_incline * rng.choice([-1.0, 1.0], (*shape, 2))
-
-
-SUITES: dict[str, Callable[[Config, np.random.Generator, tuple[int, int]], np.ndarray]] = {
-    "paper": _paper_targets,
-    "corner": _corner_targets,
-}
-"""Name -> targets (scenarios, n, 2) in deg."""
-
-
-def make_scenarios(
-    config: Config, suite: str, scenarios: int, duration: float, seed: int
-) -> tilt.Scenario:
-    """Draws a suite's scenarios.
-
-    Scenario k of a seed is the same however many are drawn.
-
-    Raises:
-      EvaluationError: for an unknown suite.
-    """
-    if suite not in SUITES:
-        raise EvaluationError(f"unknown suite {suite!r}; known suites: {', '.join(SUITES)}")
-    count = tilt.num_targets(config.task, duration)
-    rngs = [np.random.default_rng((seed, k)) for k in range(scenarios)]
-    targets = [SUITES[suite](config, rng, (1, count))[0] for rng in rngs]
-    return tilt.Scenario(np.asarray(targets), np.zeros(scenarios))
+def observing(policy: Policy) -> Controller:
+    """The policy as a controller: it looks at the observation alone."""
+    return lambda view: policy(view.obs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,18 +72,22 @@ def roll_out(
     threads: int | None = None,
     record: bool = False,
     progress: Callable[[float], None] = lambda share: None,
+    conditions: Conditions | None = None,
+    noise_seed: int = 0,
 ) -> Rollout:
     """Runs a controller in plain MuJoCo.
 
     Args:
       scene: model and stance.
       config: the task.
-      controller: sees observations, chooses action indices.
-      scenarios: targets (n, k, 2), phase (n,).
+      controller: chooses action indices.
+      scenarios: targets (n, k, 2), phase (n,), rate (n,).
       duration: s, rounded up to whole decisions.
       threads: worker threads; all cores if none.
       record: whether to keep every qpos.
       progress: called with the share done.
+      conditions: of every world (n,); nominal if none.
+      noise_seed: seed of the sensor noise.
 
     Returns:
       The rollout of n scenarios.
@@ -118,32 +97,49 @@ def roll_out(
     decisions = int(np.ceil(duration / task.ctrl_dt - 1e-9))
     steps = decisions * task.sim_steps
     table = action_table(task)
+    stand = int(nearest_action(task, np.zeros(2)))
     batch = Batch(scene.model, count, threads or os.cpu_count() or 1)
+    rng = np.random.default_rng(noise_seed)
+    sigma = None
+    latency = np.zeros(count, bool)
+    if conditions is not None:
+        for name, values in model_fields(scene, conditions).items():
+            batch.expand(name)[...] = values
+        batch.set_const()
+        latency = conditions.latency.astype(bool)
+        sigma = conditions.imu_noise if conditions.imu_noise.any() else None
     batch.qpos = scene.stance.qpos
     batch.qvel = scene.stance.qvel
     batch.qacc_warmstart = scene.stance.qacc_warmstart
-    qpos = np.tile(scene.stance.qpos, (count, 1))
     heights = np.tile(standing_heights(config), (count, 1))
-    imu = np.tile(scene.stance.imu, (count, task.history, 1))
+    pending = np.full(count, stand)
+    imu = np.tile(scene.stance.imu, (count, max(task.history, task.sim_steps), 1))
     tilts = np.full((count, steps), task.fail_tilt)
     actions = np.full((count, decisions), np.nan)
     fell_at = np.full(count, steps)
-    trace = np.tile(qpos[:, None], (1, steps, 1)) if record else None
+    trace = np.tile(scene.stance.qpos, (count, steps, 1)) if record else None
     alive = np.arange(count)
     began = time.perf_counter()
     for k in range(decisions):
-        obs = observation(config, scene, qpos[alive], imu[alive])
-        change = table[controller(obs)]
+        some = tilt.Scenario(*(x[alive] for x in scenarios))
+        qpos = batch.qpos[alive]
+        obs = observation(config, scene, qpos, imu[alive, -task.history :])
+        recent = imu[alive, -task.sim_steps :]
+        chosen = controller(View(alive, k, obs, recent, qpos, batch.qvel[alive], some))
+        taken = np.where(latency[alive], pending[alive], chosen)
+        pending[alive] = chosen
+        change = table[taken]
         before = heights[alive]
         heights[alive] = apply_action(task, robot, before, change)
-        some = tilt.Scenario(scenarios.targets[alive], scenarios.phase[alive])
         now = np.full(len(alive), float(k))
         ctrl = decision_ctrl(config, scene, some, now, before, heights[alive])
         out = batch.rollout(task.sim_steps, ctrl, record=("qpos", "sensordata"), ids=alive)
-        qpos[alive] = out["qpos"][:, -1]
-        imu[alive] = extend_history(imu[alive], out["sensordata"][..., scene.imu])
+        samples = out["sensordata"][..., scene.imu]
+        if sigma is not None:
+            samples = samples + sigma[alive, None] * rng.normal(size=samples.shape)
+        imu[alive] = extend_history(imu[alive], samples)
         tilted = body_tilt(out["qpos"][..., scene.trunk_quat])
-        actions[alive, k] = 1000 * np.abs(change).mean(axis=-1)
+        actions[alive, k] = 1000 * np.abs(table[chosen]).mean(axis=-1)
 
         span = slice(k * task.sim_steps, (k + 1) * task.sim_steps)
         bad = failed(task, tilted)
@@ -184,8 +180,22 @@ def summarize(rollout: Rollout, suite: str, duration: float, seed: int) -> dict[
             "max": float(tilts.max()),
         },
         "action_mm_mean": float(np.nanmean(rollout.action_mm)),
+        "action_mm_settled": settled_action(rollout),
         "physics_steps_per_second": float(rollout.fell_at.sum() / rollout.seconds),
     }
+
+
+def settled_action(rollout: Rollout) -> float | None:
+    """Mean commanded height change, mm per decision and axis, while the board rests.
+
+    Taken over the last `SETTLED_SECONDS` of every period of a standing robot; none if
+    there is no such decision.
+    """
+    task = rollout.config.task
+    until = task.target_period - np.arange(rollout.action_mm.shape[1]) * task.ctrl_dt
+    until = until % task.target_period
+    values = rollout.action_mm[:, (until > 1e-9) & (until <= SETTLED_SECONDS + 1e-9)]
+    return None if np.isnan(values).all() else float(np.nanmean(values))
 
 
 def policy_scene(policy: Policy, visual: bool = False) -> Scene:
@@ -214,14 +224,117 @@ def evaluate(
     """Evaluates a policy in plain MuJoCo; returns the JSON of `summarize`.
 
     Raises:
-      EvaluationError: for an unknown suite, or no scenarios or time.
+      EvaluationError: if there are no scenarios or no time.
+      SuiteError: for an unknown suite.
       PolicyError: if the policy belongs to another scene.
+    """
+    scene = policy_scene(policy)
+    rollout = run_suite(
+        scene, policy.config, observing(policy), suite, scenarios, duration, seed, progress
+    )
+    return summarize(rollout, suite, duration, seed)
+
+
+def run_suite(
+    scene: Scene,
+    config: Config,
+    controller: Controller,
+    suite: str,
+    scenarios: int,
+    duration: float,
+    seed: int,
+    progress: Callable[[float], None] = lambda share: None,
+    record: bool = False,
+) -> Rollout:
+    """Rolls a controller out on a suite's scenarios.
+
+    Raises:
+      EvaluationError: if there are no scenarios or no time.
+      SuiteError: for an unknown suite.
     """
     if scenarios < 1:
         raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
     if not (np.isfinite(duration) and duration > 0):
         raise EvaluationError(f"duration is {duration}; it must be a number of seconds above 0")
-    drawn = make_scenarios(policy.config, suite, scenarios, duration, seed)
-    scene = policy_scene(policy)
-    rollout = roll_out(scene, policy.config, policy, drawn, duration, progress=progress)
-    return summarize(rollout, suite, duration, seed)
+    drawn, conditions = make_scenarios(config, suite, scenarios, duration, seed)
+    return roll_out(
+        scene,
+        config,
+        controller,
+        drawn,
+        duration,
+        record=record,
+        progress=progress,
+        conditions=conditions if find_suite(suite).random != RandomConfig() else None,
+        noise_seed=seed,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Envelope:
+    """How a controller fares over the greatest incline and the speed of the board."""
+
+    inclines: list[float]
+    """Board angle on both axes at once, deg."""
+    rates: list[float]
+    """Board speed on each axis, deg/s."""
+    fall_rate: list[list[float]]
+    """[incline][rate] share of the scenarios that end in a fall."""
+    mean_tilt: list[list[float]]
+    """[incline][rate] deg, a fall counting as fail_tilt to the end."""
+    authority: float
+    """Speed beyond which the action set cannot follow, deg/s (`suites.authority`)."""
+    reach: float
+    """Incline beyond which the legs are too short, deg (`suites.reach`)."""
+    scenarios: int
+    """Per cell."""
+    duration_s: float
+    seed: int
+
+    @property
+    def fall_free_share(self) -> float:
+        """Share of the cells that can be followed in which nothing falls."""
+        feasible = (np.asarray(self.inclines)[:, None] <= self.reach) & (
+            np.asarray(self.rates) <= self.authority
+        )
+        return float(np.mean(np.asarray(self.fall_rate)[feasible] == 0))
+
+
+ENVELOPE_INCLINES = tuple(np.arange(2.0, 12.1, 1.0).tolist())
+ENVELOPE_RATES = tuple(np.arange(2.5, 6.1, 0.25).tolist())
+
+
+def envelope(
+    scene: Scene,
+    config: Config,
+    controller: Controller,
+    scenarios: int,
+    duration: float,
+    seed: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Envelope:
+    """Maps falls and tilt over inclines and board speeds, with targets of suite `corner`.
+
+    Raises:
+      EvaluationError: if there are no scenarios.
+    """
+    if scenarios < 1:
+        raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
+    cells = [(i, r) for i in ENVELOPE_INCLINES for r in ENVELOPE_RATES]
+    drawn, _ = make_scenarios(config, "corner", len(cells) * scenarios, duration, seed)
+    incline, rate = np.repeat(np.asarray(cells), scenarios, axis=0).T
+    signs = np.sign(drawn.targets)
+    drawn = drawn._replace(targets=incline[:, None, None] * signs, rate=rate)
+    rollout = roll_out(scene, config, controller, drawn, duration, progress=progress)
+    shape = (len(ENVELOPE_INCLINES), len(ENVELOPE_RATES), scenarios)
+    return Envelope(
+        inclines=list(ENVELOPE_INCLINES),
+        rates=list(ENVELOPE_RATES),
+        fall_rate=rollout.fell.reshape(shape).mean(axis=-1).tolist(),
+        mean_tilt=rollout.tilt.mean(axis=-1).reshape(shape).mean(axis=-1).tolist(),
+        authority=authority(config),
+        reach=reach(config),
+        scenarios=scenarios,
+        duration_s=duration,
+        seed=seed,
+    )

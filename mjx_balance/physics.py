@@ -1,8 +1,8 @@
 """Advances one world by one decision in MJX.
 
-An engine is a function `(state, ctrl (sim_steps, nu)) -> (state, Motion)`. The
-state holds only what a physics step reads, so that it is cheap to carry, to reset
-and to save, and so that the environment need not know the engine behind it.
+An engine is an `Advance`. The state holds only what a physics step reads, so that it
+is cheap to carry, to reset and to save, and so that the environment need not know the
+engine behind it.
 """
 
 import copy
@@ -42,7 +42,8 @@ class Motion(NamedTuple):
     """(sim_steps,) body tilt after each step, deg."""
 
 
-Advance = Callable[[PhysicsState, jax.Array], tuple[PhysicsState, Motion]]
+Advance = Callable[[PhysicsState, jax.Array, dict[str, jax.Array]], tuple[PhysicsState, Motion]]
+"""(state, ctrl (sim_steps, nu), model fields that differ in this world) -> (state, motion)."""
 
 
 def initial_state(scene: Scene) -> PhysicsState:
@@ -64,15 +65,20 @@ def mjx_advance(scene: Scene) -> Advance:
         model = mjx.put_model(training_model)
         blank = mjx.make_data(training_model)
 
-    def physics_step(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Motion]:
-        data = blank.replace(**state._asdict(), ctrl=ctrl)
-        # TF32 matrix products, the default on recent GPUs, are too coarse for contacts.
-        with jax.default_matmul_precision("highest"):
-            data = mjx.step(model, data)
-        state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        return state, Motion(data.sensordata[scene.imu], body_tilt(data.qpos[scene.trunk_quat]))
+    def advance(
+        state: PhysicsState, ctrl: jax.Array, fields: dict[str, jax.Array]
+    ) -> tuple[PhysicsState, Motion]:
+        world = model.replace(**fields)
 
-    def advance(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Motion]:
+        def physics_step(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Motion]:
+            data = blank.replace(**state._asdict(), ctrl=ctrl)
+            # TF32 matrix products, the default on recent GPUs, are too coarse for contacts.
+            with jax.default_matmul_precision("highest"):
+                data = mjx.step(world, data)
+            state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+            tilt = body_tilt(data.qpos[scene.trunk_quat])
+            return state, Motion(data.sensordata[scene.imu], tilt)
+
         return jax.lax.scan(physics_step, state, ctrl)
 
     return advance

@@ -4,12 +4,36 @@ Training (JAX) and evaluation (NumPy) both go through here, so that there is one
 definition of a decision's controls and of its observation.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mjx_balance.config import Config
 from mjx_balance.scene import Scene
 from mjx_balance.task import Array, legs, tilt
 from mjx_balance.task.observation import observe
+
+
+class View(NamedTuple):
+    """All there is to see when n worlds of an evaluation take a decision.
+
+    A policy looks at `obs` alone; baselines may look at what no robot knows.
+    """
+
+    ids: np.ndarray
+    """(n,) numbers of these worlds in the batch, for controllers with a memory."""
+    decision: int
+    """Decisions since the start."""
+    obs: np.ndarray
+    """(n, obs_size) the network's input."""
+    imu: np.ndarray
+    """(n, sim_steps, 6) IMU samples of the last decision."""
+    qpos: np.ndarray
+    """(n, nq) true positions."""
+    qvel: np.ndarray
+    """(n, nv) true velocities."""
+    scenario: tilt.Scenario
+    """Where the boards go."""
 
 
 def decision_ctrl(

@@ -6,6 +6,7 @@ observation layout and scaling, action table, rates, scene fingerprint, versions
 and where the training came from.
 """
 
+import hashlib
 import importlib.metadata
 import json
 import math
@@ -23,7 +24,7 @@ from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
 
 FORMAT = "mjx_balance.policy"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 
 
@@ -58,6 +59,7 @@ class Policy:
             self.config = check(from_dict(Config, manifest["config"]))
             network = manifest["network"]
             self.factors = tuple(int(n) for n in network["factors"])
+            self.radial = bool(network["radial"])
             hidden_sizes = tuple(int(n) for n in network["hidden_sizes"])
             self.actions = np.asarray(manifest["actions"]["table_m"], np.float32)
             obs_size = len(manifest["observation"]["names"])
@@ -83,11 +85,29 @@ class Policy:
         self.manifest = manifest
         self.observation_size = obs_size
         names = [f"hidden_{i}" for i in range(len(hidden_sizes))] + ["head"]
-        sizes = (obs_size, *hidden_sizes, sum(self.factors))
+        rows = [obs_size, *hidden_sizes]
+        columns = [*hidden_sizes, sum(self.factors)]
+        if self.radial:
+            rows[-1] += obs_size
+            columns[-1] = 1 + len(self.factors)
+            shape = _weight(weights, "profile", (4,))
+            self._profile = np.logaddexp(0, shape)
+            self._stretch = np.exp(_weight(weights, "stretch", (len(self.factors),)))
+            axes = [np.linspace(-1, 1, levels) for levels in self.factors]
+            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+            self._points = points.reshape(-1, len(self.factors)).astype(np.float32)
         self._layers = []
-        for name, rows, columns in zip(names, sizes[:-1], sizes[1:], strict=True):
-            kernel = _weight(weights, f"{name}/kernel", (rows, columns))
-            self._layers.append((kernel, _weight(weights, f"{name}/bias", (columns,))))
+        for name, n, m in zip(names, rows, columns, strict=True):
+            kernel = _weight(weights, f"{name}/kernel", (n, m))
+            self._layers.append((kernel, _weight(weights, f"{name}/bias", (m,))))
+
+    @property
+    def fingerprint(self) -> str:
+        """Short digest of the weights."""
+        digest = hashlib.sha256()
+        for kernel, bias in self._layers:
+            digest.update(kernel.tobytes() + bias.tobytes())
+        return digest.hexdigest()[:16]
 
     def q_values(self, obs: np.ndarray) -> np.ndarray:
         """Action values.
@@ -101,7 +121,7 @@ class Policy:
         Raises:
           ValueError: if obs has another size.
         """
-        x = np.asarray(obs, np.float32)
+        obs = x = np.asarray(obs, np.float32)
         if x.ndim not in (1, 2) or x.shape[-1] != self.observation_size:
             raise ValueError(
                 f"obs has shape {x.shape}; it must be ({self.observation_size},) or "
@@ -110,6 +130,12 @@ class Policy:
         for kernel, bias in self._layers[:-1]:
             x = np.maximum(x @ kernel + bias, 0.0)
         kernel, bias = self._layers[-1]
+        if self.radial:
+            out = np.concatenate((x, obs), axis=-1) @ kernel + bias
+            alpha, beta, kappa, delta = self._profile
+            away = (self._points - out[..., None, 1:]) * self._stretch
+            z = np.sqrt(delta**2 + np.sum(away**2, axis=-1))
+            return out[..., :1] + alpha * np.exp(-beta * z) - kappa * z
         branches = np.split(x @ kernel + bias, np.cumsum(self.factors)[:-1], axis=-1)
         values = branches[0]
         for branch in branches[1:]:
@@ -155,7 +181,11 @@ def make_manifest(
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "config": to_dict(config),
-        "network": {"hidden_sizes": list(config.dqn.hidden_sizes), "factors": list(factors)},
+        "network": {
+            "hidden_sizes": list(config.dqn.hidden_sizes),
+            "factors": list(factors),
+            "radial": config.dqn.head == "radial",
+        },
         "observation": {
             "names": list(observation_names(task, config.robot)),
             "scale": observation_scale(task, config.robot).tolist(),
@@ -173,6 +203,17 @@ def make_manifest(
     }
 
 
+def flat_weights(params: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Names every array of a flax network's variables, e.g. `hidden_0/kernel`."""
+    weights = {}
+    for layer, value in params["params"].items():
+        arrays = value.items() if isinstance(value, Mapping) else [("", value)]
+        for name, array in arrays:
+            key = f"{layer}/{name}" if name else layer
+            weights[key] = np.ascontiguousarray(array, np.float32)
+    return weights
+
+
 def save_policy(
     path: str | os.PathLike[str], params: Mapping[str, Any], manifest: dict[str, Any]
 ) -> Policy:
@@ -180,17 +221,13 @@ def save_policy(
 
     Args:
       path: where to.
-      params: the flax network's variables, {"params": {layer: {kernel, bias}}}.
+      params: the flax network's variables, {"params": {layer: {kernel, bias}, name: array}}.
       manifest: from `make_manifest`.
 
     Returns:
       The policy as it will be loaded.
     """
-    weights = {
-        f"{layer}/{name}": np.ascontiguousarray(value, np.float32)
-        for layer, arrays in params["params"].items()
-        for name, value in arrays.items()
-    }
+    weights = flat_weights(params)
     policy = Policy(manifest, weights)
     part = Path(path).with_suffix(".part")
     safetensors.numpy.save_file(weights, part, metadata={"manifest": json.dumps(manifest)})

@@ -1,151 +1,52 @@
-"""Figures and tables of a run folder. No JAX."""
+"""Tables for a terminal, and one self-contained HTML page about runs. No JAX."""
 
+import base64
+import dataclasses
+import html
+import io
 import json
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from mjx_balance.config import Config, TaskConfig
-from mjx_balance.evaluation import make_scenarios, policy_scene, roll_out
-from mjx_balance.policy import Policy
-from mjx_balance.task.reward import reward_terms
+from mjx_balance import figures, render
+from mjx_balance.baselines import CONTROLLERS, make_controller
+from mjx_balance.config import Config, check, from_dict, preset, to_dict
+from mjx_balance.evaluation import (
+    Controller,
+    Envelope,
+    envelope,
+    observing,
+    policy_scene,
+    run_suite,
+    summarize,
+)
+from mjx_balance.policy import Policy, PolicyError, load_policy
+from mjx_balance.scene import Scene
+from mjx_balance.statistics import TILTS, over_seeds
 
-mpl.use("Agg")
-import matplotlib.pyplot as plt
-
-RECORD_SECONDS = 100.0
-RECORD_SEED = 2_000_000
-BLUE, ORANGE, GREY = "#2166ac", "#d6604d", "#777777"
-STYLE: dict[Any, Any] = {
-    "figure.dpi": 110,
-    "savefig.dpi": 150,
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "legend.frameon": False,
-    "axes.titlelocation": "left",
-}
-
-
-def draw_figures(run_dir: Path, policy: Policy) -> list[Path]:
-    """Draws a run's figures into its folder.
-
-    Args:
-      run_dir: with metrics.jsonl.
-      policy: the run's policy.
-
-    Returns:
-      The files written.
-    """
-    figures = run_dir / "figures"
-    figures.mkdir(exist_ok=True)
-    lines = (run_dir / "metrics.jsonl").read_text().splitlines()
-    with plt.rc_context(STYLE):
-        drawn = {
-            "learning_curves.png": learning_curves([json.loads(line) for line in lines]),
-            "reward.png": reward_figure(policy.config.task),
-            "rollout.png": rollout_figure(policy),
-        }
-        for name, figure in drawn.items():
-            figure.savefig(figures / name, bbox_inches="tight")
-            plt.close(figure)
-    return [figures / name for name in drawn]
+SUITES = ("paper", "corner")
+SEED = 4_000_000
+"""Seed of the report's own scenarios."""
+DURATION = 60.0
+ENVELOPE_SCENARIOS = 2
+ENVELOPE_DURATION = 30.0
+VIDEO_SECONDS = 12.0
+EDGES = np.concatenate(([0.0], np.geomspace(0.01, 6.0, 160), [6.0001]))
+"""Bins of the tilt distribution, deg."""
+CACHE = "report.json"
+PARTS = ("config.json", "metrics.jsonl", "policy.safetensors", "evaluation.json")
 
 
-def learning_curves(metrics: list[dict[str, float]]) -> plt.Figure:
-    """Tilt, falls, reward, loss, epsilon and speed over the decisions of a run."""
-    panels = (
-        ("train/tilt_deg", "mean body tilt [deg]", "log"),
-        ("train/falls_per_minute", "falls per robot-minute", "symlog"),
-        ("train/reward", "reward per decision", "linear"),
-        ("train/loss", "squared TD error", "log"),
-        ("train/epsilon", "epsilon", "linear"),
-        ("perf/env_steps_per_second", "decisions per second", "linear"),
-    )
-    figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
-    steps = np.asarray([m["env_steps"] for m in metrics]) / 1000
-    for axis, (name, title, scale) in zip(axes.flat, panels, strict=True):
-        values = np.asarray([m[name] for m in metrics])
-        if scale == "log":
-            values = np.where(values > 0, values, np.nan)  # no update yet, no loss
-        axis.plot(steps, values, color=BLUE, lw=1.6)
-        axis.set_title(title)
-        axis.set_yscale(scale, **({"linthresh": 0.1} if scale == "symlog" else {}))
-        if name == "train/tilt_deg":
-            axis.yaxis.set_major_formatter("{x:g}")
-            axis.yaxis.set_minor_formatter("{x:g}")
-        if scale in ("linear", "symlog") and name != "train/reward":
-            axis.set_ylim(bottom=0)
-    for axis in axes[-1]:
-        axis.set_xlabel("thousand decisions")
-    return figure
-
-
-def reward_figure(task: TaskConfig) -> plt.Figure:
-    """The paper's Fig. 4, the reward for the tilt, beside our reading of its Fig. 5."""
-    tilt = np.linspace(0, task.fail_tilt, 301)
-    change = np.linspace(-2, 2, 301)
-    none = np.zeros_like(tilt)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    left.plot(tilt, reward_terms(task, tilt, tilt, none)["level"], color=BLUE, lw=2)
-    left.set_title("instant incline (paper Eq. 4, Fig. 4)")
-    left.set_xlabel("body tilt [deg]")
-    left.set_ylabel("reward")
-    toward = reward_terms(task, change, none, none)["toward"]
-    right.plot(change, np.where(toward >= 0, toward, np.nan), color="#4d9221", lw=2)
-    right.plot(change, np.where(toward <= 0, toward, np.nan), color=ORANGE, lw=2)
-    right.set_title("toward horizontal (our reading of Fig. 5)")
-    right.set_xlabel("tilt before less tilt after [deg]")
-    return figure
-
-
-def rollout_figure(policy: Policy) -> plt.Figure:
-    """The paper's Fig. 7 for this policy: board and body angles over 100 s in plain MuJoCo."""
-    config = policy.config
-    scene = policy_scene(policy)
-    scenario = make_scenarios(config, "paper", 1, RECORD_SECONDS, RECORD_SEED)
-    rollout = roll_out(scene, config, policy, scenario, RECORD_SECONDS, record=True)
-    assert rollout.qpos is not None
-    qpos = rollout.qpos[0]
-    roll, pitch = roll_pitch(qpos[:, scene.trunk_quat])
-    time = np.arange(1, len(qpos) + 1) * config.task.sim_dt
-    board = np.degrees(qpos[:, scene.board_qpos])
-    rows = (
-        (board[:, 0], "board X", GREY),
-        (board[:, 1], "board Y", GREY),
-        (roll, "body roll", BLUE),
-        (pitch, "body pitch", ORANGE),
-    )
-    figure, axes = plt.subplots(4, 1, figsize=(11, 7), sharex=True, layout="constrained")
-    limit = config.task.max_incline
-    for axis, (values, name, colour) in zip(axes, rows, strict=True):
-        axis.plot(time, values, color=colour, lw=1.2)
-        axis.set_ylabel(f"{name} [deg]")
-        axis.set_ylim(-limit, limit)
-        axis.axhline(0, color="black", lw=0.5)
-        for change in np.arange(0, time[-1], config.task.target_period):
-            axis.axvline(change, color="black", lw=0.8, ls=":")
-    axes[0].set_title(
-        f"{RECORD_SECONDS:.0f} s in plain MuJoCo: mean tilt {rollout.tilt.mean():.2f} deg, "
-        f"greatest {rollout.tilt.max():.2f} deg" + (", the robot fell" if rollout.fell[0] else "")
-    )
-    axes[-1].set_xlabel("time [s]; dotted: the board takes a new target")
-    return figure
-
-
-def roll_pitch(quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Roll and pitch (...) in deg of unit quaternions (..., 4), yaw first convention."""
-    w, x, y, z = np.moveaxis(quat, -1, 0)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    return np.degrees(roll), np.degrees(pitch)
+class ReportError(ValueError):
+    """A report that cannot be made; the message says why."""
 
 
 def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
@@ -170,6 +71,26 @@ def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
     return table
 
 
+def seeds_table(summary: dict[str, dict[str, Any]]) -> Table:
+    """A table for people: one row per suite, interquartile means over the seeds."""
+    title = "over the seeds: interquartile mean, 95% bootstrap interval, tilt in deg"
+    table = Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
+    )
+    table.add_column("suite", style="bold", no_wrap=True)
+    for name in ("seeds", "falls", *TILTS):
+        table.add_column(name, justify="right", no_wrap=True)
+    for suite, row in summary.items():
+        cells = (spread(row[name]) for name in TILTS)
+        table.add_row(suite, str(row["seeds"]), str(row["falls"]), *cells)
+    return table
+
+
+def spread(value: dict[str, float]) -> str:
+    """An interquartile mean and its interval, e.g. `0.081 (0.079-0.084)`."""
+    return f"{value['iqm']:.3f} ({value['low']:.3f}-{value['high']:.3f})"
+
+
 def print_summary(
     console: Console, run_dir: Path, results: dict[str, dict[str, Any]], seconds: float
 ) -> None:
@@ -183,17 +104,389 @@ def print_summary(
         ("checkpoints/", "the whole training state"),
     ):
         console.print(f"{run_dir / name}  [dim]{what}[/dim]", highlight=False, soft_wrap=True)
+    console.print(f"`mjx-balance report {run_dir}` makes a page of it", highlight=False)
     console.print(f"done in {seconds:.0f} s", highlight=False)
 
 
-def record(policy: Policy, suite: str, duration: float, seed: int) -> tuple[Config, np.ndarray]:
-    """Rolls out a suite's first scenario for a video.
+@dataclasses.dataclass
+class Run:
+    """What could be read of a run folder."""
+
+    path: Path
+    missing: list[str] = dataclasses.field(default_factory=list)
+    """One sentence per part that is missing or unusable."""
+    config: Config | None = None
+    metrics: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    policy: Policy | None = None
+    evaluation: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
+    seeds: dict[str, Any] | None = None
+
+
+def read_run(path: Path) -> Run:
+    """Reads what there is.
+
+    Raises:
+      ReportError: if nothing in the folder belongs to a run.
+    """
+    if not any((path / name).is_file() for name in PARTS):
+        raise ReportError(
+            f"{path} is no run folder: it has none of {', '.join(PARTS)}; "
+            "`mjx-balance train` makes one"
+        )
+    run = Run(path)
+
+    def read(name: str, parse: Callable[[Path], Any]) -> Any:
+        file = path / name
+        if not file.is_file():
+            run.missing.append(f"{file} is missing")
+            return None
+        try:
+            return parse(file)
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            run.missing.append(f"{file} cannot be used: {error}")
+            return None
+
+    run.config = read("config.json", lambda f: check(from_dict(Config, json.loads(f.read_text()))))
+    run.metrics = read("metrics.jsonl", _read_metrics) or []
+    run.policy = read("policy.safetensors", load_policy)
+    run.evaluation = read("evaluation.json", lambda f: json.loads(f.read_text())) or {}
+    if (path / "seeds.json").is_file():
+        run.seeds = read("seeds.json", lambda f: json.loads(f.read_text()))
+    return run
+
+
+def _read_metrics(file: Path) -> list[dict[str, Any]]:
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    if not lines:
+        raise ValueError("it holds no line yet")
+    return lines
+
+
+def write_report(
+    run_dirs: Sequence[Path],
+    out: Path,
+    scenarios: int,
+    progress: Callable[[str], Any],
+) -> list[str]:
+    """Writes one HTML file that needs nothing else.
+
+    The first run that has a policy is shown beside the baselines, on scenarios of the
+    report's own; what that takes is kept in its folder (`report.json`).
+
+    Args:
+      run_dirs: run folders, whole or not.
+      out: file to write.
+      scenarios: per suite and controller.
+      progress: title -> context manager that gives a callable taking the share done.
 
     Returns:
-      The config, and (steps, nq) states.
+      What is missing, one sentence each.
+
+    Raises:
+      ReportError: for a folder that is no run folder.
     """
-    scenario = make_scenarios(policy.config, suite, 1, duration, seed)
-    scene = policy_scene(policy)
-    rollout = roll_out(scene, policy.config, policy, scenario, duration, record=True)
+    runs = [read_run(path) for path in run_dirs]
+    missing = [sentence for run in runs for sentence in run.missing]
+    parts = []
+    shown = next((run for run in runs if run.policy is not None), None)
+    if shown is not None and shown.policy is not None:
+        try:
+            scene = policy_scene(shown.policy)
+            data = _measure(shown, scene, scenarios, progress)
+            parts += _summary(runs, shown.policy, data)
+            parts += _pictures(shown.policy, scene, data, missing)
+        except PolicyError as error:
+            missing.append(f"{shown.path}: {error}")
+    curves = [run.metrics for run in runs if run.metrics]
+    if curves:
+        caption = (
+            "Training. The line is the median over the seeds, the band their extremes; tilt, falls "
+            "and reward are those of the exploring policy."
+        )
+        parts.append(_figure("Learning curves", figures.learning_curves(curves), caption))
+    config = next((run.config for run in runs if run.config is not None), None)
+    if config is not None:
+        reward = figures.reward_figure(config.task)
+        parts.append(_figure("Reward (Fig. 4 and 5 of the paper)", reward, _reward_caption(config)))
+        parts.append(_config(config))
+    parts.append(_reproduce(runs, config, out))
+    notes = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in missing)
+    if notes:
+        parts.insert(0, f'<section class="missing"><h2>Missing</h2><ul>{notes}</ul></section>')
+    names = ", ".join(run.path.name for run in runs)
+    page = PAGE.format(title=html.escape(f"mjx_balance: {names}"), body="\n".join(parts))
+    out.write_text(page)
+    return missing
+
+
+def _measure(
+    run: Run, scene: Scene, scenarios: int, progress: Callable[[str], Any]
+) -> dict[str, Any]:
+    """Policy and baselines on the same scenarios; read back if it was done before."""
+    assert run.policy is not None
+    config, file = run.policy.config, run.path / CACHE
+    key = [run.policy.fingerprint, scenarios, DURATION, SEED]
+    try:
+        saved = json.loads(file.read_text())
+        if saved["key"] == key:
+            return saved
+    except (OSError, ValueError, KeyError):
+        pass
+    data: dict[str, Any] = {"key": key, "results": {}, "histogram": {}}
+    for name in ("policy", *CONTROLLERS):
+        data["results"][name], data["histogram"][name] = {}, {}
+        for suite in SUITES:
+            controller = (
+                observing(run.policy) if name == "policy" else make_controller(name, scene, config)
+            )
+            with progress(f"{name}, suite {suite}") as bar:
+                rollout = run_suite(
+                    scene, config, controller, suite, scenarios, DURATION, SEED, bar
+                )
+            data["results"][name][suite] = summarize(rollout, suite, DURATION, SEED)
+            counts, _ = np.histogram(rollout.tilt, EDGES)
+            data["histogram"][name][suite] = (counts / counts.sum()).tolist()
+    with progress("envelope") as bar:
+        mapped = envelope(
+            scene, config, observing(run.policy), ENVELOPE_SCENARIOS, ENVELOPE_DURATION, SEED, bar
+        )
+    data["envelope"] = dataclasses.asdict(mapped)
+    file.write_text(json.dumps(data) + "\n")
+    return data
+
+
+def _summary(runs: list[Run], policy: Policy, data: dict[str, Any]) -> list[str]:
+    """Headline figures, the table against the baselines, and the seeds if there are several."""
+    results = data["results"]
+    mapped = Envelope(**data["envelope"])
+    ours = results["policy"]
+    tiles = [
+        (f"{ours['paper']['tilt_deg']['mean']:.3f}°", "mean tilt, targets in any direction"),
+        (f"{ours['corner']['tilt_deg']['mean']:.3f}°", "mean tilt, both axes at 7° at once"),
+        (
+            str(ours["paper"]["falls"] + ours["corner"]["falls"]),
+            f"falls in {2 * ours['paper']['scenarios']} scenarios of {DURATION:g} s",
+        ),
+        (f"{100 * mapped.fall_free_share:.0f}%", "of the feasible envelope free of falls"),
+    ]
+    shown = "".join(f"<div><b>{value}</b><span>{what}</span></div>" for value, what in tiles)
+    described = {
+        "policy": f"this network: {policy.observation_size} raw inputs",
+        "none": "stands still",
+        "pd-imu": "PD on a complementary filter of the same IMU",
+        "pd-attitude": "PD on the true attitude",
+        "rate-oracle": "predictive, true attitude and board rate",
+        "clairvoyant": "predictive, knows the board's future",
+    }
+    rows = []
+    for name, suites in results.items():
+        cells = [f"<td><b>{name}</b></td><td>{described[name]}</td>"]
+        for suite in SUITES:
+            result, tilt = suites[suite], suites[suite]["tilt_deg"]
+            cells.append(f"<td>{result['falls']}</td>")
+            cells += [f"<td>{tilt[key]:.3f}</td>" for key in ("mean", "p95", "max")]
+        settled = suites["paper"]["action_mm_settled"]
+        cells.append("<td>-</td>" if settled is None else f"<td>{settled:.3f}</td>")
+        mark = ' class="ours"' if name == "policy" else ""
+        rows.append(f"<tr{mark}>{''.join(cells)}</tr>")
+    count = ours["paper"]["scenarios"]
+    parts = [
+        f'<div class="tiles">{shown}</div>',
+        "<section><h2>Against the baselines</h2><table><thead><tr><th rowspan=2></th>"
+        "<th rowspan=2>sees</th><th colspan=4>suite <i>paper</i></th><th colspan=4>suite <i>"
+        "corner</i></th><th rowspan=2>moves at rest<br>mm</th></tr><tr>"
+        + "<th>falls</th><th>mean</th><th>p95</th><th>max</th>"
+        * 2
+        + f"</tr></thead><tbody>{''.join(rows)}</tbody></table><p>Plain MuJoCo, {count} held-out "
+        f"scenarios of {DURATION:g} s per suite (seed {SEED}), tilt in degrees over every physics "
+        "step; from a fall on it counts as 6°. All take the same 21 x 21 actions at 5 Hz. The last "
+        "column is the mean height change commanded per decision in the last 3 s of each period. "
+        "The paper gives no figures; it reports a high peak of the tilt when the board turns on "
+        "both axes at once, and that its controller cannot handle that.</p></section>",
+    ]
+    several = [run for run in runs if run.seeds is not None]
+    each = [run.evaluation for run in runs if run.evaluation]
+    if several and several[0].seeds is not None:
+        parts.append(_seeds(several[0].seeds["statistics"]))
+    elif len(each) > 1:
+        shared = [suite for suite in SUITES if all(suite in result for result in each)]
+        parts.append(_seeds({s: over_seeds([result[s] for result in each]) for s in shared}))
+    return parts
+
+
+def _seeds(statistics: dict[str, Any]) -> str:
+    rows = "".join(
+        f"<tr><td><b>{suite}</b></td><td>{row['seeds']}</td><td>{row['falls']} of "
+        f"{row['scenarios']}</td>"
+        + "".join(
+            f"<td>{spread(row[name])}</td><td>{row[name]['worst']:.3f}</td>" for name in TILTS
+        )
+        + "</tr>"
+        for suite, row in statistics.items()
+    )
+    heads = "".join(f"<th>{name}</th><th>worst seed</th>" for name in TILTS)
+    return (
+        "<section><h2>Over the training seeds</h2><table><thead><tr><th>suite</th><th>seeds</th>"
+        f"<th>falls</th>{heads}</tr></thead><tbody>{rows}</tbody></table><p>Interquartile mean "
+        "over the seeds and its 95% bootstrap interval, tilt in degrees, each run's own evaluation."
+        "</p></section>"
+    )
+
+
+def _pictures(policy: Policy, scene: Scene, data: dict[str, Any], missing: list[str]) -> list[str]:
+    config = policy.config
+    both: dict[str, Controller] = {
+        "policy": observing(policy),
+        "pd-imu": make_controller("pd-imu", scene, config),
+    }
+    parts = []
+    for suite, what in (
+        ("paper", "targets in any direction"),
+        ("corner", "both axes at once, the case the paper's controller cannot handle"),
+    ):
+        figure = figures.rollout_figure(scene, config, both, suite)
+        caption = f"The paper's Fig. 7 for suite {suite} ({what}), beside the PD on the same IMU."
+        parts.append(_figure(f"100 s on the board: {suite}", figure, caption))
+    shares = {name: np.asarray(h["paper"]) for name, h in data["histogram"].items()}
+    parts.append(
+        _figure(
+            "Tilt distribution",
+            figures.tilt_figure(shares, EDGES),
+            "Suite paper, every physics step of every scenario.",
+        )
+    )
+    mapped = Envelope(**data["envelope"])
+    caption = (
+        f"Targets on both axes at once, {mapped.scenarios} scenarios of {mapped.duration_s:g} s "
+        f"per cell. Right of or above the dashed line the action set cannot follow: 3 mm five "
+        f"times a second turn the body at {mapped.authority:.2f} deg/s in pitch, and the legs "
+        f"reach {mapped.reach:.1f} deg. Inside, {100 * mapped.fall_free_share:.0f}% of the cells "
+        "are free of falls."
+    )
+    parts.append(
+        _figure("Envelope", figures.envelope_figure(mapped, config.task.fail_tilt), caption)
+    )
+    rollout = run_suite(
+        scene, config, observing(policy), "corner", 1, VIDEO_SECONDS, SEED, record=True
+    )
     assert rollout.qpos is not None
-    return policy.config, rollout.qpos[0]
+    with tempfile.TemporaryDirectory() as folder:
+        video = Path(folder) / "video.mp4"
+        try:
+            render.write(video, config, rollout.qpos[0])
+        except render.RenderError as error:
+            missing.append(f"no video: {error}")
+        else:
+            encoded = base64.b64encode(video.read_bytes()).decode()
+            parts.append(
+                '<section><h2>Video</h2><video controls muted loop preload="auto" '
+                f'src="data:video/mp4;base64,{encoded}"></video><p>{VIDEO_SECONDS:g} s of suite '
+                "corner in plain MuJoCo, at real speed.</p></section>"
+            )
+    return parts
+
+
+def _figure(title: str, figure: plt.Figure, caption: str) -> str:
+    """A figure as part of the page."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, bbox_inches="tight")
+    plt.close(figure)
+    encoded = base64.b64encode(buffer.getvalue()).decode()
+    return (
+        f'<section><h2>{html.escape(title)}</h2><img alt="{html.escape(title)}" '
+        f'src="data:image/png;base64,{encoded}"><p>{html.escape(caption)}</p></section>'
+    )
+
+
+def _reward_caption(config: Config) -> str:
+    where = "at the decision's end" if config.task.reward_tilt == "end" else "averaged over it"
+    return f"The reward of one decision; the tilt is taken {where}."
+
+
+def _config(config: Config) -> str:
+    """What differs from the paper's preset, and everything."""
+    ours, papers = (_flat(to_dict(c)) for c in (config, preset("paper")))
+    rows = "".join(
+        f"<tr><td><code>{name}</code></td><td>{html.escape(str(papers[name]))}</td>"
+        f"<td>{html.escape(str(value))}</td></tr>"
+        for name, value in ours.items()
+        if value != papers[name]
+    )
+    everything = html.escape(json.dumps(to_dict(config), indent=2))
+    return (
+        "<section><h2>Config</h2><table><thead><tr><th>field</th><th>preset <i>paper</i></th>"
+        f"<th>this run</th></tr></thead><tbody>{rows}</tbody></table><details><summary>every field"
+        f"</summary><pre>{everything}</pre></details></section>"
+    )
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def _reproduce(runs: list[Run], config: Config | None, out: Path) -> str:
+    lines = []
+    if config is not None:
+        seeds = f" --num-seeds {config.num_seeds}" if config.num_seeds > 1 else ""
+        lines.append(f"mjx-balance train --preset {config.preset} --seed {config.seed}{seeds}")
+    for run in runs:
+        if run.policy is not None:
+            lines.append(f"mjx-balance evaluate {run.path / 'policy.safetensors'} --suite corner")
+    lines.append(f"mjx-balance report {' '.join(str(run.path) for run in runs)} --out {out}")
+    policy = next((run.policy for run in runs if run.policy is not None), None)
+    versions = ""
+    if policy is not None:
+        listed = ", ".join(f"{k} {v}" for k, v in policy.manifest["versions"].items() if v)
+        versions = f"<p>Versions of the training: {html.escape(listed)}.</p>"
+    commands = html.escape("\n".join(lines))
+    extra = (
+        "<p>The config above holds every field that the preset does not: pass those that differ "
+        "as flags.</p>"
+    )
+    return f"<section><h2>Reproduce</h2><pre>{commands}</pre>{extra}{versions}</section>"
+
+
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,">
+<title>{title}</title>
+<style>
+:root {{ color-scheme: light; }}
+body {{ margin: 0 auto; padding: 2.5rem 1.5rem 4rem; max-width: 68rem; background: #fff;
+  color: #1c2430; font: 16px/1.55 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; }}
+h1 {{ font-size: 1.7rem; margin: 0 0 1.2rem; }}
+h2 {{ font-size: 1.15rem; margin: 0 0 .7rem; }}
+section {{ margin: 2.6rem 0 0; overflow-x: auto; }}
+p {{ color: #4b5768; font-size: .92rem; max-width: 58rem; }}
+img, video {{ max-width: 100%; height: auto; display: block; }}
+video {{ width: 48rem; border-radius: 6px; }}
+table {{ border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }}
+th, td {{ padding: .32rem .7rem; text-align: right; border-bottom: 1px solid #e3e8ef; }}
+th {{ font-weight: 600; color: #4b5768; }}
+td:first-child, td:nth-child(2), th:first-child {{ text-align: left; }}
+tr.ours td {{ background: #eaf2fb; }}
+.tiles {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(13rem, 1fr)); gap: 1rem; }}
+.tiles div {{ background: #f4f7fa; border-radius: 8px; padding: 1rem 1.2rem; }}
+.tiles b {{ display: block; font-size: 1.75rem; color: #2166ac; }}
+.tiles span {{ font-size: .88rem; color: #4b5768; }}
+.missing {{ background: #fff6e5; border-radius: 8px; padding: 1rem 1.2rem; }}
+pre {{ background: #f4f7fa; border-radius: 6px; padding: .9rem 1.1rem; overflow-x: auto;
+  font-size: .85rem; }}
+summary {{ cursor: pointer; margin-top: .8rem; }}
+</style>
+</head>
+<body>
+<h1>{title}</h1>
+{body}
+</body>
+</html>
+"""

@@ -3,7 +3,9 @@
 import contextlib
 import dataclasses
 import json
+import math
 import os
+import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -11,22 +13,36 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
+import psutil
 from tensorboardX import SummaryWriter
 
-from mjx_balance import evaluation, report
+from mjx_balance import evaluation, figures, report
 from mjx_balance.checkpoint import Checkpoints
 from mjx_balance.config import Config, ConfigError, check, from_dict, to_dict
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.env import BalanceEnv
-from mjx_balance.policy import Policy, load_policy, make_manifest, save_policy
+from mjx_balance.policy import Policy, flat_weights, load_policy, make_manifest, save_policy
 from mjx_balance.program_cache import compile_cached, digest, enable_compilation_cache
+from mjx_balance.statistics import over_seeds
 
+STATE_COPIES = 2
+"""A checkpoint is read back beside the state that it replaces."""
+PROGRAM_BYTES = 1.3 * 2**30
+"""Memory of a run besides its state: libraries, compiler, program (benchmarks/README.md)."""
 CPU_ENVS = 256
 ACCELERATOR_ENVS = 2048
+PER_SEED = ("tilt_deg", "reward", "loss")
+"""Metrics that are also logged for every seed, where there are several."""
+EVALUATED = ("paper", "corner")
+"""Suites of the evaluation after training."""
 EVALUATION_SEED = 1_000_000
 """Seed of the final evaluation's scenarios; training draws from other generators."""
+VALIDATION_SEED = 3_000_000
+"""Seed of the scenarios that choose among several training seeds; never reported."""
+VALIDATION_SCENARIOS = 32
 
 
 class RunFolderError(ValueError):
@@ -58,6 +74,11 @@ class RunFolder:
     @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
+
+    @property
+    def seeds(self) -> Path:
+        """Policy and evaluation of every seed, where there are several."""
+        return self.path / "seeds"
 
     @property
     def policy(self) -> Path:
@@ -176,17 +197,41 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
     assert config.num_devices is not None
     return Learner(
         env,
-        QNetwork(config.dqn.hidden_sizes, action_factors(config, env)),
+        QNetwork(config.dqn.hidden_sizes, action_factors(config, env), config.dqn.head == "radial"),
         config.dqn,
         config.num_envs,
         config.num_env_steps,
         jax.devices()[: config.num_devices],
+        config.num_seeds,
     )
+
+
+def check_memory(config: Config, learner: Learner) -> None:
+    """Refuses a state that would not fit, before anything is allocated.
+
+    Raises:
+      ConfigError: with the estimate.
+    """
+    shapes = jax.eval_shape(lambda: learner.init(config.seed))
+    state = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes))
+    needed = STATE_COPIES * state + PROGRAM_BYTES
+    device = learner.mesh.devices.ravel()[0]
+    if device.platform == "cpu":
+        available = psutil.virtual_memory().available
+    else:
+        needed /= learner.num_devices
+        available = (device.memory_stats() or {}).get("bytes_limit", math.inf)
+    if needed > available:
+        raise ConfigError(
+            f"num_seeds is {config.num_seeds}: that takes about {needed / 2**30:.1f} GiB, and "
+            f"{available / 2**30:.1f} GiB are free; train fewer seeds at once, or lower "
+            "replay_capacity"
+        )
 
 
 def action_factors(config: Config, env: BalanceEnv) -> tuple[int, ...]:
     """Output branches of the network: all actions at once, or roll and pitch apart."""
-    return env.action_factors if config.dqn.head == "factored" else (env.action_size,)
+    return (env.action_size,) if config.dqn.head == "joint" else env.action_factors
 
 
 def train(
@@ -213,6 +258,8 @@ def train(
     configure_jax()
     sized = size_to_device(config)
     env = BalanceEnv(sized)
+    learner = make_learner(sized, env)
+    check_memory(sized, learner)
     if resume is None:
         name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         folder = create_run_folder(run_dir or Path("runs") / name, sized)
@@ -221,16 +268,16 @@ def train(
         saved = read_run_config(resume)
         check_same_config(saved, sized, resume)
     with _stop_on_interrupt() as stop:
-        state, seconds = _learn(sized, env, folder, resume is not None, display, stop)
-        policy = _export(sized, env, folder, state, seconds)
+        state, seconds = _learn(sized, learner, folder, resume is not None, display, stop)
+        policies = _export(sized, learner, folder, state, seconds)
         if stop:
             raise Interrupted(
-                f"stopped at {int(state.env_steps):,} decisions; the policy so far is "
+                f"stopped at {_number(state.env_steps):,} decisions; the policy so far is "
                 f"{folder.policy}; continue with --resume {folder.path}"
             )
-    results = _evaluate(sized, policy, folder, display)
+    results = _evaluate(sized, policies, folder, display)
     with display.phase("drawing figures"):
-        report.draw_figures(folder.path, load_policy(folder.policy))
+        figures.draw_figures(folder.path, load_policy(folder.policy))
     folder.evaluation.write_text(json.dumps(results, indent=2) + "\n")
     report.print_summary(display.console, folder.path, results, time.perf_counter() - began)
     return results
@@ -238,7 +285,7 @@ def train(
 
 def _learn(
     config: Config,
-    env: BalanceEnv,
+    learner: Learner,
     folder: RunFolder,
     resume: bool,
     display: Display,
@@ -249,9 +296,10 @@ def _learn(
     Returns:
       The last state, and the seconds spent learning by this call.
     """
-    learner = make_learner(config, env)
+    last = config.seed + config.num_seeds - 1
+    seeds = f"seed {last}" if last == config.seed else f"seeds {config.seed} to {last}"
     display.say(
-        f"{folder.path}: preset {config.preset}, seed {config.seed}, {config.num_envs} boards on "
+        f"{folder.path}: preset {config.preset}, {seeds}, {config.num_envs} boards on "
         f"{config.num_devices} {jax.devices()[0].device_kind} device(s)"
     )
     checkpoints = Checkpoints(folder.checkpoints)
@@ -263,11 +311,12 @@ def _learn(
         program = compile_cached(learner.train_program(per_call // config.num_envs), state, key)
     if resume:
         state = checkpoints.restore(state)
-        display.say(f"resuming at {int(state.env_steps):,} decisions")
-    _drop_metrics_after(folder.metrics, int(state.env_steps))
+        display.say(f"resuming at {_number(state.env_steps):,} decisions")
+    _drop_metrics_after(folder.metrics, _number(state.env_steps))
 
     total = -(-config.num_env_steps // per_call) * per_call
-    done, saved_at, seconds = int(state.env_steps), int(state.env_steps), 0.0
+    done = saved_at = _number(state.env_steps)
+    seconds = 0.0
     with (
         folder.metrics.open("a") as log,
         SummaryWriter(str(folder.tensorboard)) as board,
@@ -276,11 +325,19 @@ def _learn(
         while done < total and not stop:
             began = time.perf_counter()
             state, raw = program(state)
-            done = int(state.env_steps)
+            done = _number(state.env_steps)
             elapsed = time.perf_counter() - began
             seconds += elapsed
-            metrics = _named(config, raw, per_call / elapsed)
-            line = {"env_steps": done, "gradient_steps": int(state.gradient_steps), **metrics}
+            raw = jax.device_get(raw)
+            mean = {name: float(np.mean(value)) for name, value in raw.items()}
+            metrics = _named(config, mean, config.num_seeds * per_call / elapsed)
+            line: dict[str, Any] = {
+                "env_steps": done,
+                "gradient_steps": _number(state.gradient_steps),
+                **metrics,
+            }
+            if config.num_seeds > 1:
+                line["seeds"] = {name: raw[name].tolist() for name in PER_SEED}
             log.write(json.dumps(line) + "\n")
             log.flush()
             for name, value in metrics.items():
@@ -294,9 +351,14 @@ def _learn(
     return state, seconds
 
 
-def _named(config: Config, raw: dict[str, jax.Array], rate: float) -> dict[str, float]:
+def _number(count: jax.Array) -> int:
+    """A counter of the state, the same for every seed."""
+    return int(np.ravel(count)[0])
+
+
+def _named(config: Config, raw: dict[str, float], rate: float) -> dict[str, float]:
     """Metrics under the names they are logged by."""
-    metrics = {f"train/{name}": float(value) for name, value in raw.items()}
+    metrics = {f"train/{name}": value for name, value in raw.items()}
     falls = metrics.pop("train/fall")
     metrics["train/falls_per_minute"] = falls * 60 / config.task.ctrl_dt
     metrics["perf/env_steps_per_second"] = rate
@@ -305,34 +367,101 @@ def _named(config: Config, raw: dict[str, jax.Array], rate: float) -> dict[str, 
 
 
 def _export(
-    config: Config, env: BalanceEnv, folder: RunFolder, state: TrainState, seconds: float
-) -> Policy:
-    provenance = {
-        "env_steps": int(state.env_steps),
-        "gradient_steps": int(state.gradient_steps),
-        "seconds_learning_since_start_or_resume": round(seconds, 1),
-        "device": jax.devices()[0].device_kind,
-        "date": time.strftime("%Y-%m-%d"),
-    }
-    manifest = make_manifest(config, env.scene.hash, action_factors(config, env), provenance)
-    return save_policy(folder.policy, jax.device_get(state.params), manifest)
+    config: Config, learner: Learner, folder: RunFolder, state: TrainState, seconds: float
+) -> list[Policy]:
+    """Writes one policy per seed; the first also as the run's, until a better one is known."""
+    known = state._replace(env_state=None, replay=None)  # pyright: ignore[reportArgumentType]
+    env = learner.env
+    assert isinstance(env, BalanceEnv)
+    policies = []
+    for k in range(config.num_seeds):
+        mine = jax.tree.map(lambda x: x[k], known) if config.num_seeds > 1 else known  # noqa: B023
+        mine = jax.device_get(learner.exported(mine))
+        provenance = {
+            "env_steps": _number(state.env_steps),
+            "gradient_steps": _number(state.gradient_steps),
+            "seconds_learning_since_start_or_resume": round(seconds, 1),
+            "device": jax.devices()[0].device_kind,
+            "date": time.strftime("%Y-%m-%d"),
+        }
+        own = dataclasses.replace(config, seed=config.seed + k)
+        manifest = make_manifest(own, env.scene.hash, action_factors(config, env), provenance)
+        if config.num_seeds > 1:
+            folder.seeds.mkdir(exist_ok=True)
+            save_policy(folder.seeds / f"seed-{own.seed}.safetensors", mine, manifest)
+        if k == 0:
+            save_policy(folder.policy, mine, manifest)
+        policies.append(Policy(manifest, flat_weights(mine)))
+    return policies
 
 
 def _evaluate(
-    config: Config, policy: Policy, folder: RunFolder, display: Display
+    config: Config, policies: list[Policy], folder: RunFolder, display: Display
 ) -> dict[str, dict[str, Any]]:
-    results = {}
-    for suite in evaluation.SUITES:
-        with display.bar(f"evaluating in plain MuJoCo, suite {suite}") as bar:
-            results[suite] = evaluation.evaluate(
-                policy, suite, config.eval_scenarios, config.eval_duration, EVALUATION_SEED, bar
-            )
+    """Evaluates every seed; the run's policy becomes the one that validates best."""
+    each = []
+    for policy in policies:
+        results = {}
+        for suite in EVALUATED:
+            title = f"evaluating in plain MuJoCo, suite {suite}"
+            if len(policies) > 1:
+                title += f", seed {policy.config.seed}"
+            with display.bar(title) as bar:
+                results[suite] = evaluation.evaluate(
+                    policy, suite, config.eval_scenarios, config.eval_duration, EVALUATION_SEED, bar
+                )
+        each.append(results)
+    best = _choose(config, policies, each, folder, display) if len(policies) > 1 else 0
     with SummaryWriter(str(folder.tensorboard)) as board:
-        for suite, result in results.items():
+        for suite, result in each[best].items():
             board.add_scalar(f"eval/{suite}/falls", result["falls"], config.num_env_steps)
             for name, value in result["tilt_deg"].items():
                 board.add_scalar(f"eval/{suite}/tilt_{name}", value, config.num_env_steps)
-    return results
+    return each[best]
+
+
+def _choose(
+    config: Config,
+    policies: list[Policy],
+    each: list[dict[str, dict[str, Any]]],
+    folder: RunFolder,
+    display: Display,
+) -> int:
+    """Validates every seed, makes the best one the run's policy, writes seeds.json."""
+    scores, rows = [], []
+    for policy, results in zip(policies, each, strict=True):
+        validated = []
+        for suite in EVALUATED:
+            with display.bar(f"validating seed {policy.config.seed}, suite {suite}") as bar:
+                validated.append(
+                    evaluation.evaluate(
+                        policy,
+                        suite,
+                        VALIDATION_SCENARIOS,
+                        config.eval_duration,
+                        VALIDATION_SEED,
+                        bar,
+                    )
+                )
+        scores.append(
+            (sum(r["falls"] for r in validated), sum(r["tilt_deg"]["mean"] for r in validated))
+        )
+        rows.append(
+            {
+                "seed": policy.config.seed,
+                "validation": dict(zip(EVALUATED, validated, strict=True)),
+                "evaluation": results,
+            }
+        )
+    best = scores.index(min(scores))
+    chosen = folder.seeds / f"seed-{policies[best].config.seed}.safetensors"
+    shutil.copyfile(chosen, folder.policy)
+    summary = {suite: over_seeds([results[suite] for results in each]) for suite in EVALUATED}
+    written = {"best": policies[best].config.seed, "statistics": summary, "seeds": rows}
+    (folder.path / "seeds.json").write_text(json.dumps(written, indent=2) + "\n")
+    display.say(f"best of the {len(policies)} seeds on the validation set: {written['best']}")
+    display.console.print(report.seeds_table(summary))
+    return best
 
 
 @contextlib.contextmanager

@@ -2,7 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State
+
+from mjx_balance.task.symmetry import Symmetries
 
 
 class Probe(Env):
@@ -75,3 +78,17 @@ class NoisyState(Probe):
         return self._next(
             state, 0.0, jnp.asarray(state.obs)[0] * (2.0 * action - 1), terminated=1.0
         )
+
+
+class PositiveState(NoisyState):
+    """The same with observations above 0 alone; it says how it looks in a mirror."""
+
+    symmetries = Symmetries(
+        obs_index=np.zeros((2, 1), np.int32),
+        obs_sign=np.asarray(((1.0,), (-1.0,)), np.float32),
+        action_index=np.asarray(((0, 1), (1, 0)), np.int32),
+    )
+
+    def reset(self, rng: jax.Array) -> State:
+        state = super().reset(rng)
+        return state.replace(obs=jnp.abs(jnp.asarray(state.obs)))

@@ -38,6 +38,10 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (("--ctrl-dt", "0.0101"), "ctrl_dt is 0.0101 s; it must be a whole multiple"),
         (("--max-incline", "12"), "max_incline is 12.0 deg"),
         (("--num-envs", "0"), "num_envs is 0"),
+        (("--num-seeds", "0"), "num_seeds is 0"),
+        (("--num-seeds", "100000", "--num-envs", "64"), "num_seeds is 100000: that takes about"),
+        (("--reward-tilt", "sideways"), "--reward-tilt"),
+        (("--payload", "-1"), "payload is -1.0"),
         (("--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
         (("--thigh", "0.25"), "thigh is 0.25"),
         (("--learning-rate", "nan"), "learning_rate is nan"),
@@ -94,9 +98,18 @@ def test_resuming_a_finished_run_is_refused(
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("fly",), "unknown command 'fly'; known commands: train, evaluate"),
+        (("fly",), "unknown command 'fly'; known commands: train, evaluate, report"),
         (("evaluate", "none.safetensors"), "no policy file at none.safetensors"),
         (("evaluate", "text"), "text is damaged or no safetensors file"),
+        (("evaluate",), "name a policy file or --controller NAME"),
+        (("evaluate", "text", "--controller", "none"), "name a policy file or --controller NAME"),
+        (("evaluate", "--controller", "lqr"), "unknown controller 'lqr'; known controllers: none"),
+        (
+            ("evaluate", "--controller", "none", "--suite", "moon"),
+            "unknown suite 'moon'; known suites: paper, corner, noise",
+        ),
+        (("report",), "name at least one run folder"),
+        (("report", "."), ". is no run folder: it has none of config.json"),
         (("evaluate", "text", "--json", "no/such/out.json"), "cannot write no/such/out.json"),
     ],
 )

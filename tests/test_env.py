@@ -146,8 +146,8 @@ def test_mjx_moves_as_plain_mujoco_does(config: Config, env: BalanceEnv, reset, 
     rollout = roll_out(
         env.scene,
         config,
-        lambda obs: actions[next(step)],
-        Scenario(np.asarray(scenario.targets, float), np.asarray(scenario.phase, float)),
+        lambda view: actions[next(step)],
+        Scenario(*(np.asarray(x, float) for x in scenario)),
         decisions * config.task.ctrl_dt,
     )
     assert not rollout.fell.any()

@@ -11,17 +11,24 @@ PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
     ("config", "quiet"),
-    ("task", "task.actions", "task.legs", "task.observation", "task.reward", "task.tilt"),
-    ("scene", "policy", "dqn", "dqn.networks", "dqn.replay", "dqn.losses"),
+    (
+        *"task task.actions task.conditions task.legs task.observation task.reward".split(),
+        *"task.symmetry task.tilt statistics".split(),
+    ),
+    ("scene", "suites", "policy", *"dqn dqn.networks dqn.replay dqn.losses dqn.whitening".split()),
     ("plant", "dqn.learner"),
-    ("physics", "evaluation"),
-    ("env", "render", "report", "display", "checkpoint", "program_cache"),
+    ("physics", "baselines", "evaluation"),
+    ("env", "render", "figures", "display", "checkpoint", "program_cache"),
+    ("report",),
     ("training",),
     ("cli",),
     ("__main__",),
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
-WITHOUT_JAX = set("config quiet task scene plant policy evaluation render report display".split())
+WITHOUT_JAX = set(
+    "config quiet task scene suites plant policy baselines evaluation statistics render figures "
+    "report display".split()
+)
 JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
 
 

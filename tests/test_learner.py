@@ -11,8 +11,10 @@ import pytest
 
 from mjx_balance.checkpoint import CheckpointError, Checkpoints
 from mjx_balance.config import DQNConfig
-from mjx_balance.dqn.learner import Learner, TrainState, epsilon
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn import whitening
+from mjx_balance.dqn.learner import Learner, TrainState, dither, epsilon, mirrored
+from mjx_balance.dqn.networks import QNetwork, fold_inputs
+from mjx_balance.dqn.replay import Transition
 
 CONFIG = DQNConfig(
     gamma=0.5,
@@ -30,9 +32,10 @@ CONFIG = DQNConfig(
 ENVS, ITERATIONS = 8, 400
 
 
-def make(env: probes.Probe, **changes) -> Learner:
+def make(env: probes.Probe, num_seeds: int = 1, **changes) -> Learner:
     config = dataclasses.replace(CONFIG, **changes)
-    return Learner(env, QNetwork(config.hidden_sizes, (2,)), config, ENVS, ENVS * ITERATIONS)
+    network = QNetwork(config.hidden_sizes, (2,))
+    return Learner(env, network, config, ENVS, ENVS * ITERATIONS, num_seeds=num_seeds)
 
 
 def trained(learner: Learner, seed: int = 0) -> TrainState:
@@ -41,7 +44,7 @@ def trained(learner: Learner, seed: int = 0) -> TrainState:
 
 
 def values(learner: Learner, state: TrainState, obs: float) -> np.ndarray:
-    return np.asarray(learner._q_values(state.params, jnp.full(1, obs)))
+    return np.asarray(learner.network.apply(learner.exported(state), jnp.full(1, obs)))
 
 
 @pytest.mark.parametrize("double", [False, True])
@@ -86,6 +89,99 @@ def test_equal_seeds_equal_parameters_other_seeds_others() -> None:
     )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-3
+
+
+def test_several_seeds_are_as_many_runs() -> None:
+    """One program of three seeds learns what three programs learn."""
+    state, metrics = make(probes.NoisyState(), num_seeds=3).train_program(60)(
+        make(probes.NoisyState(), num_seeds=3).init(5)
+    )
+    together = jax.device_get(state)
+    assert metrics["loss"].shape == (3,)
+    for k in range(3):
+        single = make(probes.NoisyState())
+        alone, alone_metrics = single.train_program(60)(single.init(5 + k))
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a[k], b, atol=1e-4),  # noqa: B023
+            together.params,
+            jax.device_get(alone.params),
+        )
+        np.testing.assert_array_equal(together.gradient_steps[k], alone.gradient_steps)
+        assert metrics["loss"][k] == pytest.approx(float(alone_metrics["loss"]), rel=1e-3)
+
+
+def test_mirrored_transitions_are_reflections_of_themselves() -> None:
+    count = 400
+    obs = jnp.linspace(0.1, 1, count)[:, None]
+    batch = Transition(obs, jnp.zeros(count, int), obs[:, 0], jnp.zeros(count), 2 * obs)
+    got = mirrored(probes.PositiveState.symmetries, batch, jax.random.PRNGKey(0))
+    flipped = np.asarray(got.action) == 1
+    assert 0.4 < flipped.mean() < 0.6
+    sign = np.where(flipped, -1.0, 1.0)[:, None]
+    np.testing.assert_allclose(got.obs, sign * obs, rtol=1e-6)
+    np.testing.assert_allclose(got.next_obs, 2 * sign * obs, rtol=1e-6)
+    np.testing.assert_array_equal(got.reward, batch.reward)
+
+
+def test_mirror_teaches_what_was_never_seen() -> None:
+    """Only positive observations are shown; the values of negative ones are learnt too."""
+    errors = {}
+    for mirror in (False, True):
+        learner = make(probes.PositiveState(), mirror=mirror)
+        got = values(learner, trained(learner), -0.7)
+        errors[mirror] = np.abs(got - (0.7, -0.7)).max()
+    assert errors[True] < 0.1 < errors[False]
+
+
+def test_whitened_observations_are_uncorrelated_and_of_equal_size() -> None:
+    """Three nearly equal sensors: after whitening, covariance I where there is variance."""
+    rng = np.random.default_rng(0)
+    common = rng.normal(size=(4_000, 1))
+    obs = 5 + common + 0.1 * rng.normal(size=(4_000, 3))
+    seen = whitening.init(3)
+    for batch in np.split(obs, 40):
+        mean = jnp.asarray(batch.mean(axis=0))
+        seen = whitening.update(seen, mean, jnp.asarray(np.cov(batch.T, bias=True)))
+    white = (obs - np.asarray(seen.mean)) @ np.asarray(whitening.matrix(seen, 1e-6))
+    np.testing.assert_allclose(np.cov(white.T), np.eye(3), atol=0.15)
+    damped = (obs - obs.mean(axis=0)) @ np.asarray(whitening.matrix(seen, 1.0))
+    assert np.linalg.eigvalsh(np.cov(damped.T))[0] < 0.02, "below the floor nothing is blown up"
+
+
+@pytest.mark.parametrize("radial", [False, True])
+def test_exported_parameters_take_raw_observations(radial: bool) -> None:
+    rng = np.random.default_rng(0)
+    network = QNetwork((8, 6), (3, 4), radial)
+    shapes = jax.eval_shape(network.init, jax.random.PRNGKey(0), jnp.zeros(5))
+    params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), shapes)
+    mean = jnp.asarray(rng.normal(size=5), jnp.float32)
+    matrix = jnp.asarray(rng.normal(size=(5, 5)), jnp.float32)
+    obs = jnp.asarray(rng.normal(size=(20, 5)), jnp.float32)
+    expected = network.apply(params, (obs - mean) @ matrix)
+    folded = fold_inputs(params, mean, matrix)
+    np.testing.assert_allclose(
+        np.asarray(network.apply(folded, obs)), np.asarray(expected), rtol=2e-4, atol=2e-4
+    )
+
+
+def test_learns_with_whitening_and_then_keeps_it() -> None:
+    learner = make(probes.NoisyState(), whiten_steps=100 * ENVS)
+    state = trained(learner)
+    assert float(state.inputs.batches) == 100
+    for obs in (-0.8, 0.3):
+        np.testing.assert_allclose(values(learner, state, obs), (-obs, obs), atol=0.1)
+
+
+def test_dither_moves_each_digit_by_a_few_levels() -> None:
+    keys = jax.random.split(jax.random.PRNGKey(0), 2_000)
+    inside = np.asarray(jax.vmap(lambda k: dither(k, jnp.int32(21 * 10 + 4), (21, 21), 2))(keys))
+    x, y = np.divmod(inside, 21)
+    assert set(x) == {8, 9, 10, 11, 12}
+    assert set(y) == {2, 3, 4, 5, 6}
+    assert np.abs(np.corrcoef(x, y)[0, 1]) < 0.1
+    corner = np.asarray(jax.vmap(lambda k: dither(k, jnp.int32(20), (21, 21), 2))(keys))
+    assert set(corner // 21) == {0, 1, 2}
+    assert set(corner % 21) == {18, 19, 20}
 
 
 def test_no_update_before_the_replay_is_warm() -> None:

@@ -58,6 +58,38 @@ def test_three_factors_are_a_mixed_radix_number() -> None:
     assert values[1 * 12 + 2 * 4 + 3] == pytest.approx(a[1] + b[2] + c[3], rel=1e-5)
 
 
+def test_radial_values_by_hand() -> None:
+    """No hidden layer, no input: the head's bias is V and mu."""
+    network = QNetwork((), (3, 5), radial=True)
+    log_e_minus_1 = np.log(np.e - 1)  # softplus of it is 1
+    params = {
+        "head": {"kernel": np.zeros((4, 3)), "bias": np.asarray((2.0, 0.5, -0.5))},
+        "profile": np.full(4, log_e_minus_1),
+        "stretch": np.log(np.asarray((2.0, 1.0))),
+    }
+    values = np.asarray(network.apply({"params": params}, jnp.zeros(2))).reshape(3, 5)
+    for i, x in enumerate((-1.0, 0.0, 1.0)):
+        for j, y in enumerate((-1.0, -0.5, 0.0, 0.5, 1.0)):
+            z = np.sqrt(1 + (2 * (x - 0.5)) ** 2 + (y + 0.5) ** 2)
+            assert values[i, j] == pytest.approx(2 + np.exp(-z) - z, abs=1e-5)
+
+
+def test_best_radial_action_is_the_nearest_to_mu() -> None:
+    """Wherever mu is, in the grid or beyond it."""
+    network = QNetwork((), (21, 21), radial=True)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        mu = rng.uniform(-1.5, 1.5, 2)
+        params = {
+            "head": {"kernel": np.zeros((4, 3)), "bias": np.asarray((0.0, *mu))},
+            "profile": rng.normal(size=4),
+            "stretch": np.zeros(2),
+        }
+        best = int(np.argmax(np.asarray(network.apply({"params": params}, jnp.zeros(2)))))
+        nearest = np.rint(10 * (np.clip(mu, -1, 1) + 1)).astype(int)
+        assert best == 21 * nearest[0] + nearest[1]
+
+
 @pytest.mark.parametrize("factors", [(441,), (21, 21)])
 def test_gradient_of_one_action_reaches_every_layer(factors: tuple[int, ...]) -> None:
     network, obs = QNetwork((16, 16), factors), random_obs(34)

@@ -20,7 +20,7 @@ from mjx_balance.config import Config, preset
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.policy import Policy, PolicyError, load_policy, make_manifest, save_policy
 
-HEADS = {"joint": (441,), "factored": (21, 21)}
+HEADS = {"joint": (441,), "factored": (21, 21), "radial": (21, 21)}
 Weights = dict[str, np.ndarray]
 Manifest = dict[str, Any]
 
@@ -33,7 +33,7 @@ def small_config(head: str) -> Config:
 def random_params(head: str) -> dict[str, Any]:
     """Variables of a flax network, weights and biases all random."""
     rng = np.random.default_rng(0)
-    network = QNetwork((24, 16), HEADS[head])
+    network = QNetwork((24, 16), HEADS[head], head == "radial")
     shapes: Any = jax.eval_shape(network.init, jax.random.PRNGKey(0), jnp.zeros(34))
     return jax.tree.map(lambda x: jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), shapes)
 
@@ -63,7 +63,8 @@ def path(tmp_path: Path) -> Path:
 def test_numpy_values_equal_the_networks(tmp_path: Path, head: str) -> None:
     policy = load_policy(written(tmp_path / "policy.safetensors", head))
     obs = np.random.default_rng(0).normal(size=(32, 34)).astype(np.float32)
-    expected = np.asarray(QNetwork((24, 16), HEADS[head]).apply(random_params(head), obs))
+    network = QNetwork((24, 16), HEADS[head], head == "radial")
+    expected = np.asarray(network.apply(random_params(head), obs))
     np.testing.assert_allclose(policy.q_values(obs), expected, atol=1e-5)
     np.testing.assert_allclose(policy.q_values(obs[3]), expected[3], atol=1e-5)
     np.testing.assert_array_equal(policy(obs), expected.argmax(axis=-1))
@@ -139,7 +140,7 @@ def test_weights_without_a_manifest_are_refused(path: Path) -> None:
         (lambda w, m: w["hidden_1/kernel"].fill(np.nan), "weight hidden_1/kernel .* not finite"),
         (lambda w, m: w["head/bias"].fill(np.inf), "weight head/bias .* not finite"),
         (lambda w, m: w.pop("head/kernel"), "weight head/kernel is missing"),
-        (lambda w, m: m.update(version=99), "format version is 99; this release reads version 1"),
+        (lambda w, m: m.update(version=99), "format version is 99; this release reads version 2"),
         (lambda w, m: m.update(format="onnx"), "format is 'onnx'"),
         (lambda w, m: m.pop("scene_hash"), "manifest cannot be used: 'scene_hash'"),
         (lambda w, m: m["config"].update(wings=2), "unknown field 'wings'"),

@@ -14,12 +14,13 @@ TIMES = np.arange(0, 42, 0.004)
 
 
 def two_targets(xp: types.ModuleType, phase: float = 0.0) -> Scenario:
-    return Scenario(xp.asarray([[7.0, -3.5], [-7.0, 0.0]]), xp.asarray(phase))
+    return Scenario(xp.asarray([[7.0, -3.5], [-7.0, 0.0]]), xp.asarray(phase), xp.asarray(3.5))
 
 
 def random_scenarios(count: int) -> Scenario:
     rng = np.random.default_rng(0)
-    return Scenario(rng.uniform(-7, 7, (count, 5, 2)), rng.uniform(0, 10, count))
+    rate = np.full(count, 3.5)
+    return Scenario(rng.uniform(-7, 7, (count, 5, 2)), rng.uniform(0, 10, count), rate)
 
 
 @pytest.mark.parametrize(
@@ -59,11 +60,19 @@ def test_board_never_exceeds_its_rate_on_either_axis() -> None:
 
 
 def test_board_arrives_within_every_period_and_stays() -> None:
-    targets, _ = random_scenarios(20)
+    scenarios = random_scenarios(20)._replace(phase=np.zeros(20))
+    targets = scenarios.targets
     rest = np.linspace(4.0, 9.999, 50)
     for k in range(targets.shape[1]):
-        angles = board_angle(TASK, Scenario(targets, np.zeros(20)), np.tile(10 * k + rest, (20, 1)))
+        angles = board_angle(TASK, scenarios, np.tile(10 * k + rest, (20, 1)))
         np.testing.assert_allclose(angles, np.tile(targets[:, k, None], (50, 1)), atol=1e-9)
+
+
+def test_every_board_has_its_own_speed(xp: types.ModuleType) -> None:
+    targets = xp.asarray(np.full((2, 1, 2), 6.0))
+    scenarios = Scenario(targets, xp.zeros(2), xp.asarray([2.0, 4.0]))
+    got = board_angle(TASK, scenarios, xp.asarray([[1.0, 2.0], [1.0, 2.0]]))
+    np.testing.assert_allclose(got[..., 0], [[2, 4], [4, 6]], atol=1e-5)
 
 
 def test_numpy_and_jax_agree() -> None:
@@ -74,10 +83,10 @@ def test_numpy_and_jax_agree() -> None:
 
 
 def test_batch_equals_a_loop(xp: types.ModuleType) -> None:
-    targets, phase = (xp.asarray(x) for x in random_scenarios(4))
+    scenarios = Scenario(*(xp.asarray(x) for x in random_scenarios(4)))
     times = xp.asarray(np.random.default_rng(1).uniform(0, 60, (4, 30)))
-    batch = board_angle(TASK, Scenario(targets, phase), times)
-    loop = [board_angle(TASK, Scenario(targets[k], phase[k]), times[k]) for k in range(4)]
+    batch = board_angle(TASK, scenarios, times)
+    loop = [board_angle(TASK, Scenario(*(x[k] for x in scenarios)), times[k]) for k in range(4)]
     np.testing.assert_allclose(batch, np.stack(loop), atol=1e-6)
 
 
@@ -94,13 +103,13 @@ def test_batch_equals_a_loop(xp: types.ModuleType) -> None:
 def test_disc_target_by_hand(
     xp: types.ModuleType, direction: float, magnitude: float, target: tuple[float, float]
 ) -> None:
-    got = disc_targets(TASK, xp.asarray(direction), xp.asarray(magnitude))
+    got = disc_targets(xp.asarray(7.0), xp.asarray(direction), xp.asarray(magnitude))
     np.testing.assert_allclose(got, target, atol=1e-5)
 
 
 def test_disc_targets_fill_the_disc_and_nothing_else() -> None:
     rng = np.random.default_rng(0)
-    targets = disc_targets(TASK, rng.uniform(size=10_000), rng.uniform(size=10_000))
+    targets = disc_targets(7.0, rng.uniform(size=10_000), rng.uniform(size=10_000))
     total = np.linalg.norm(targets, axis=-1)
     assert total.max() <= 7.0
     assert total.mean() == pytest.approx(3.5, abs=0.1), "magnitude is uniform, not area"

@@ -4,9 +4,13 @@ Envs and replay are sharded over a one-axis device mesh, parameters replicated:
 each device steps its own envs, fills its own part of the replay and samples its
 own share of every batch; gradients are averaged. On a laptop the devices are CPU
 cores, elsewhere accelerators; the program is the same.
+
+Several seeds are several runs in one program: every array of the state gets a leading
+seed axis and the iteration is vmapped over it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import flax.linen as nn
@@ -18,12 +22,14 @@ from brax.envs.base import Env, Observation, State
 from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from mjx_balance.config import DQNConfig
-from mjx_balance.dqn import replay
+from mjx_balance.dqn import replay, whitening
 from mjx_balance.dqn.losses import td_error
+from mjx_balance.dqn.networks import fold_inputs
 from mjx_balance.dqn.replay import ReplayState, Transition
+from mjx_balance.dqn.whitening import InputStatistics
 
 AXIS = "devices"
-REPLICATED, SHARDED = PartitionSpec(), PartitionSpec(AXIS)
+REPLICATED = PartitionSpec()
 
 Metrics: TypeAlias = dict[str, jax.Array]
 Params: TypeAlias = Any
@@ -31,11 +37,17 @@ Params: TypeAlias = Any
 
 
 class TrainState(NamedTuple):
-    """Everything a run is made of: saving it saves the run."""
+    """Everything a run is made of: saving it saves the run.
+
+    With several seeds, every leaf has a leading axis of that size.
+    """
 
     params: Params
+    """Of a network that takes whitened observations, where `whiten_steps` asks for that."""
     target_params: Params
     opt_state: optax.OptState
+    inputs: InputStatistics
+    """Mean and covariance of the observations."""
     env_state: State
     """(num_envs, ...) per leaf, sharded."""
     replay: ReplayState
@@ -46,6 +58,15 @@ class TrainState(NamedTuple):
     """() updates made."""
     key: jax.Array
     """PRNG key, the same on every device."""
+
+
+class Knowledge(NamedTuple):
+    """The part of the state that an update changes."""
+
+    params: Params
+    target_params: Params
+    opt_state: optax.OptState
+    gradient_steps: jax.Array
 
 
 def epsilon(config: DQNConfig, env_steps: jax.Array) -> jax.Array:
@@ -65,6 +86,24 @@ def epsilon_greedy(key: jax.Array, q_values: jax.Array, rate: jax.Array) -> jax.
     return jnp.where(jax.random.bernoulli(key_which, rate), random, greedy)
 
 
+def dither(key: jax.Array, action: jax.Array, factors: Sequence[int], levels: int) -> jax.Array:
+    """Moves an action by up to `levels` on each factor of its index, uniformly.
+
+    A greedy action alone shows a reward near its peak, which says how far off it was but
+    not to which side; its neighbours do.
+
+    Args:
+      key: PRNG key.
+      action: () index, a mixed-radix number.
+      factors: sizes of its digits.
+      levels: greatest move; digits stop at their ends.
+    """
+    move = jax.random.randint(key, (len(factors),), -levels, levels + 1)
+    digits = jnp.stack(jnp.unravel_index(action, tuple(factors))) + move
+    digits = jnp.clip(digits, 0, jnp.asarray(factors) - 1)
+    return jnp.ravel_multi_index(tuple(digits), tuple(factors), mode="clip").astype(action.dtype)
+
+
 def make_optimizer(config: DQNConfig, gradient_steps: int) -> optax.GradientTransformation:
     """Adam with clipped gradients and a cosine from learning_rate to learning_rate_end."""
     schedule = optax.cosine_decay_schedule(
@@ -73,6 +112,21 @@ def make_optimizer(config: DQNConfig, gradient_steps: int) -> optax.GradientTran
         config.learning_rate_end / config.learning_rate,
     )
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
+
+
+def mirrored(symmetries: Any, batch: Transition, key: jax.Array) -> Transition:
+    """Replaces each transition (batch, ...) by one of its reflections, chosen at random."""
+    which = jax.random.randint(key, batch.action.shape, 0, len(symmetries.obs_index))
+
+    def reflect(obs: jax.Array) -> jax.Array:
+        index = jnp.asarray(symmetries.obs_index)[which]
+        return jnp.take_along_axis(obs, index, axis=-1) * jnp.asarray(symmetries.obs_sign)[which]
+
+    return batch._replace(
+        obs=reflect(batch.obs),
+        next_obs=reflect(batch.next_obs),
+        action=jnp.asarray(symmetries.action_index)[which, batch.action],
+    )
 
 
 class Learner:
@@ -86,18 +140,23 @@ class Learner:
         num_envs: int,
         num_env_steps: int,
         devices: Sequence[Any] | None = None,
+        num_seeds: int = 1,
     ):
         """Sets the programs up; nothing is compiled yet.
 
         Args:
-          env: unbatched env; `info["truncation"]`, where it has one, marks time-outs.
+          env: unbatched env; `info["truncation"]`, where it has one, marks time-outs. With
+            `config.mirror`, its `symmetries` (obs_index, obs_sign and action_index, one row
+            per reflection) say how it looks in a mirror.
           network: maps (..., obs_size) to (..., action_size).
           config: the algorithm.
           num_envs: envs over all devices.
           num_env_steps: length of the run, for the schedules.
           devices: the mesh; all local devices if none.
+          num_seeds: independent runs trained at once.
 
         Raises:
+          AttributeError: if the env has no symmetries to mirror with.
           ValueError: if num_envs or batch_size cannot be split over the devices.
         """
         devices = list(devices or jax.devices())
@@ -112,29 +171,42 @@ class Learner:
         self.optimizer = make_optimizer(config, self.iterations * config.updates_per_step)
         self.mesh = Mesh(np.asarray(devices), (AXIS,), axis_types=(AxisType.Auto,))
         self.trace_count = 0
+        self.num_seeds = num_seeds
+        self.symmetries = env.symmetries if config.mirror else None  # pyright: ignore
+        sharded = PartitionSpec(None, AXIS) if num_seeds > 1 else PartitionSpec(AXIS)
         specs: dict[str, Any] = dict.fromkeys(TrainState._fields, REPLICATED)
-        replay_specs: list[Any] = [SHARDED, REPLICATED, REPLICATED]
-        specs |= {"env_state": SHARDED, "replay": ReplayState(*replay_specs)}
+        replay_specs: list[Any] = [sharded, REPLICATED, REPLICATED]
+        specs |= {"env_state": sharded, "replay": ReplayState(*replay_specs)}
         self.specs = TrainState(**specs)
 
     def init(self, seed: int) -> TrainState:
-        """Builds the state of a new run, on its devices."""
+        """Builds the state of a new run, or of runs `seed`, `seed + 1`, ..., on its devices."""
         program = jax.shard_map(
-            self._init, mesh=self.mesh, in_specs=REPLICATED, out_specs=self.specs, check_vma=False
+            self._each_seed(self._init),
+            mesh=self.mesh,
+            in_specs=REPLICATED,
+            out_specs=self.specs,
+            check_vma=False,
         )
-        return jax.jit(program)(jax.random.PRNGKey(seed))
+        keys = jax.vmap(jax.random.PRNGKey)(seed + jnp.arange(self.num_seeds))
+        return jax.jit(program)(keys if self.num_seeds > 1 else keys[0])
+
+    def _each_seed(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.vmap(function) if self.num_seeds > 1 else function
 
     def train_program(self, iterations: int):
         """The jitted training program: state -> (state, metrics), the state donated.
 
         Args:
-          iterations: decisions of every env per call.
+          iterations: decisions of every env per call. Metrics are means over them, with a
+            leading seed axis if there are several seeds.
         """
 
         def program(state: TrainState) -> tuple[TrainState, Metrics]:
             self.trace_count += 1
-            state, metrics = jax.lax.scan(self.iteration, state, length=iterations)
-            return state, jax.tree.map(lambda x: x.mean(), metrics)
+            step = self._each_seed(self.iteration)
+            state, metrics = jax.lax.scan(lambda s, _: step(s), state, length=iterations)
+            return state, jax.tree.map(lambda x: x.mean(axis=0), metrics)
 
         return jax.jit(
             jax.shard_map(
@@ -159,6 +231,7 @@ class Learner:
             params=params,
             target_params=jax.tree.map(jnp.copy, params),
             opt_state=self.optimizer.init(params),
+            inputs=whitening.init(obs.shape[-1]),
             env_state=env_state,
             replay=replay.init(
                 example, self.config.replay_capacity // self.num_devices, local_envs
@@ -168,11 +241,14 @@ class Learner:
             key=key,
         )
 
-    def iteration(self, state: TrainState, _=None) -> tuple[TrainState, Metrics]:
+    def iteration(self, state: TrainState) -> tuple[TrainState, Metrics]:
         """One decision of every env, then `updates_per_step` updates; runs on each device."""
         key, key_act, key_reset, key_learn = jax.random.split(state.key, 4)
         rate = epsilon(self.config, state.env_steps)
-        env_state, transition, metrics = self._collect(state, rate, key_act, key_reset)
+        if self.config.whiten_steps:
+            state = state._replace(inputs=self._watch(state))
+        whiten = self._whitener(state.inputs)
+        env_state, transition, metrics = self._collect(state, whiten, rate, key_act, key_reset)
         state = state._replace(
             env_state=env_state,
             replay=replay.add(state.replay, transition),
@@ -184,23 +260,57 @@ class Learner:
         wanted = min(self.config.min_replay_size // self.num_devices, capacity)
         ready = state.replay.size >= wanted
         keys = jax.random.split(self._device_key(key_learn), self.config.updates_per_step)
-        state, losses = jax.lax.cond(
+        before = Knowledge(*(getattr(state, name) for name in Knowledge._fields))
+        learnt, losses = jax.lax.cond(
             ready,
-            lambda s: jax.lax.scan(self._update, s, keys),
-            lambda s: (s, jnp.zeros(self.config.updates_per_step)),
-            state,
+            lambda known: jax.lax.scan(partial(self._update, state.replay, whiten), known, keys),
+            lambda known: (known, jnp.zeros(self.config.updates_per_step)),
+            before,
         )
+        state = state._replace(**learnt._asdict())
         return state, metrics | {"loss": losses.mean(), "epsilon": rate}
 
+    def _watch(self, state: TrainState) -> InputStatistics:
+        """Takes the present observations of all devices into account, as long as it should."""
+        obs = _array(state.env_state.obs)
+        mean = jax.lax.pmean(obs.mean(axis=0), AXIS)
+        away = obs - mean
+        covariance = jax.lax.pmean(away.T @ away / len(obs), AXIS)
+        seen = whitening.update(state.inputs, mean, covariance)
+        going_on = state.env_steps < self.config.whiten_steps
+        return jax.tree.map(lambda new, old: jnp.where(going_on, new, old), seen, state.inputs)
+
+    def _whitener(self, inputs: InputStatistics) -> tuple[jax.Array, jax.Array] | None:
+        if not self.config.whiten_steps:
+            return None
+        return inputs.mean, whitening.matrix(inputs, self.config.whiten_floor)
+
+    def exported(self, state: TrainState) -> Params:
+        """The parameters of one run (no seed axis) for a network that takes raw observations."""
+        whiten = self._whitener(state.inputs)
+        if whiten is None:
+            return state.params
+        return fold_inputs(state.params, *whiten)
+
     def _collect(
-        self, state: TrainState, rate: jax.Array, key_act: jax.Array, key_reset: jax.Array
+        self,
+        state: TrainState,
+        whiten: Any,
+        rate: jax.Array,
+        key_act: jax.Array,
+        key_reset: jax.Array,
     ) -> tuple[State, Transition, Metrics]:
         """Steps this device's envs once and resets those that are done."""
         before = state.env_state
         count = before.reward.shape[0]
-        q_values = self._q_values(state.params, _array(before.obs))
+        q_values = self._q_values(state.params, whiten, _array(before.obs))
         keys = jax.random.split(self._device_key(key_act), count)
         action = jax.vmap(epsilon_greedy, (0, 0, None))(keys, q_values, rate)
+        if self.config.dither:
+            keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 1)
+            factors = getattr(self.env, "action_factors", (self.env.action_size,))
+            move = partial(dither, factors=factors, levels=self.config.dither)
+            action = jax.vmap(move)(keys, action)
         after = jax.vmap(self.env.step)(before, action)
         truncation = after.info.get("truncation", jnp.zeros_like(after.done))
         transition = Transition(
@@ -224,37 +334,42 @@ class Learner:
 
         return jax.tree.map(choose, fresh, state)
 
-    def _update(self, state: TrainState, key: jax.Array) -> tuple[TrainState, jax.Array]:
+    def _update(
+        self, buffer: ReplayState, whiten: Any, known: Knowledge, key: jax.Array
+    ) -> tuple[Knowledge, jax.Array]:
         """One gradient step on a batch of which each device samples its share."""
-        batch = replay.sample(state.replay, key, self.config.batch_size // self.num_devices)
-        loss, grads = jax.value_and_grad(self._loss)(state.params, state.target_params, batch)
+        key, key_mirror = jax.random.split(key)
+        batch = replay.sample(buffer, key, self.config.batch_size // self.num_devices)
+        if self.symmetries is not None:
+            batch = mirrored(self.symmetries, batch, key_mirror)
+        loss_and_grads = jax.value_and_grad(self._loss)
+        loss, grads = loss_and_grads(known.params, known.target_params, whiten, batch)
         loss, grads = jax.lax.pmean((loss, grads), AXIS)
-        updates, opt_state = self.optimizer.update(grads, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, updates)
-        gradient_steps = state.gradient_steps + 1
+        updates, opt_state = self.optimizer.update(grads, known.opt_state, known.params)
+        params = optax.apply_updates(known.params, updates)
+        gradient_steps = known.gradient_steps + 1
         target_params = optax.periodic_update(
-            params, state.target_params, gradient_steps, self.config.target_update_period
+            params, known.target_params, gradient_steps, self.config.target_update_period
         )
-        state = state._replace(
-            params=params,
-            target_params=target_params,
-            opt_state=opt_state,
-            gradient_steps=gradient_steps,
-        )
-        return state, loss
+        return Knowledge(params, target_params, opt_state, gradient_steps), loss
 
-    def _loss(self, params: Params, target_params: Params, batch: Transition) -> jax.Array:
+    def _loss(
+        self, params: Params, target_params: Params, whiten: Any, batch: Transition
+    ) -> jax.Array:
         """Mean squared TD error (paper Eq. 1)."""
-        q_tm1 = self._q_values(params, batch.obs)
-        q_t = self._q_values(target_params, batch.next_obs)
+        q_tm1 = self._q_values(params, whiten, batch.obs)
+        q_t = self._q_values(target_params, whiten, batch.next_obs)
         discount_t = self.config.gamma * (1 - batch.terminated)
-        selector = self._q_values(params, batch.next_obs) if self.config.double else None
+        selector = self._q_values(params, whiten, batch.next_obs) if self.config.double else None
         error = jax.vmap(td_error, (0, 0, 0, 0, 0, None if selector is None else 0))(
             q_tm1, batch.action, batch.reward, discount_t, q_t, selector
         )
         return jnp.mean(error**2)
 
-    def _q_values(self, params: Params, obs: jax.Array) -> jax.Array:
+    def _q_values(self, params: Params, whiten: Any, obs: jax.Array) -> jax.Array:
+        if whiten is not None:
+            mean, matrix = whiten
+            obs = (obs - mean) @ matrix
         values = self.network.apply(params, obs)
         assert isinstance(values, jax.Array)
         return values

@@ -18,6 +18,21 @@ def action_table(task: TaskConfig) -> np.ndarray:
     return np.stack((a_x.ravel(), a_y.ravel()), axis=-1).astype(np.float32)
 
 
+def nearest_action(task: TaskConfig, change: np.ndarray) -> np.ndarray:
+    """Index of the action closest to a wanted height change.
+
+    Args:
+      task: the action grid.
+      change: (..., 2) a_x and a_y, m, of any size.
+
+    Returns:
+      (...) indices into `action_table`.
+    """
+    step = 2 * task.action_max / (task.action_levels - 1)
+    level = np.clip(np.rint((change + task.action_max) / step), 0, task.action_levels - 1)
+    return (level[..., 0] * task.action_levels + level[..., 1]).astype(int)
+
+
 def leg_signs(robot: RobotConfig) -> np.ndarray:
     """Which way each foot goes: left +a_x, right -a_x, front +a_y, hind -a_y.
 

@@ -23,6 +23,14 @@ def body_tilt(quat: Array) -> Array:
     return 2 * (180 / np.pi) * xp.arcsin(xp.clip(half_sine, 0.0, 1.0))
 
 
+def roll_pitch(quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Roll and pitch (...) in deg of unit quaternions (..., 4), yaw first convention."""
+    w, x, y, z = np.moveaxis(quat, -1, 0)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    return np.degrees(roll), np.degrees(pitch)
+
+
 def failed(task: TaskConfig, tilt: Array) -> Array:
     """True where the body tilts past `fail_tilt`, or is no number at all.
 

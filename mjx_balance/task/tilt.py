@@ -19,6 +19,8 @@ class Scenario(NamedTuple):
     """(..., n, 2) board angles about X and Y, deg."""
     phase: Array
     """(...) time the first target is already old at time 0, s."""
+    rate: Array
+    """(...) speed of the board on each axis, deg/s."""
 
 
 def num_targets(task: TaskConfig, duration: float) -> int:
@@ -29,12 +31,12 @@ def num_targets(task: TaskConfig, duration: float) -> int:
 def board_angle(task: TaskConfig, scenario: Scenario, time: Array) -> Array:
     """Commanded board angle.
 
-    Each axis moves at `board_rate` from the last target to the next and then
-    rests; config checks that it always arrives within the period, so the angle
-    is a closed form of the time.
+    Each axis moves at `rate` from the last target to the next and then rests;
+    it always arrives within the period (config checks that for the training, the
+    suites for theirs), so the angle is a closed form of the time.
 
     Args:
-      task: rates and period.
+      task: the period.
       scenario: one scenario, targets (n, 2), or a batch.
       time: (..., m) s since the start, not negative; past the last target the
         board rests there.
@@ -42,7 +44,7 @@ def board_angle(task: TaskConfig, scenario: Scenario, time: Array) -> Array:
     Returns:
       (..., m, 2) deg.
     """
-    targets, phase = scenario
+    targets, phase, rate = scenario
     xp = targets.__array_namespace__()
     clock = time + phase[..., None]
     last = targets.shape[-2] - 1
@@ -52,15 +54,15 @@ def board_angle(task: TaskConfig, scenario: Scenario, time: Array) -> Array:
     stops = xp.concatenate((level, targets), axis=-2)
     start = xp.take_along_axis(stops, period[..., None], axis=-2)
     change = xp.take_along_axis(targets, period[..., None], axis=-2) - start
-    reach = (task.board_rate * since)[..., None]
+    reach = (rate[..., None] * since)[..., None]
     return start + xp.clip(change, -reach, reach)
 
 
-def disc_targets(task: TaskConfig, direction: Array, magnitude: Array) -> Array:
-    """Targets of suite `paper`: direction and total tilt drawn from [0, 1).
+def disc_targets(incline: Array, direction: Array, magnitude: Array) -> Array:
+    """Targets in any direction (paper 3.1): direction and total tilt drawn from [0, 1).
 
     Args:
-      task: gives the greatest incline.
+      incline: (...) greatest total tilt, deg.
       direction: (...) share of a full turn.
       magnitude: (...) share of the greatest incline.
 
@@ -70,4 +72,4 @@ def disc_targets(task: TaskConfig, direction: Array, magnitude: Array) -> Array:
     xp = direction.__array_namespace__()
     angle = 2 * np.pi * direction
     unit = xp.stack((xp.cos(angle), xp.sin(angle)), axis=-1)
-    return task.max_incline * magnitude[..., None] * unit
+    return (incline * magnitude)[..., None] * unit

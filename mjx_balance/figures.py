@@ -1,0 +1,231 @@
+"""Figures of runs, policies and baselines. No JAX."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from mjx_balance.config import Config, TaskConfig
+from mjx_balance.evaluation import Controller, Envelope, observing, policy_scene, run_suite
+from mjx_balance.policy import Policy
+from mjx_balance.scene import Scene
+from mjx_balance.task.reward import reward_terms, roll_pitch
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+RECORD_SECONDS = 100.0
+RECORD_SEED = 2_000_000
+BLUE, ORANGE, GREY = "#2166ac", "#d6604d", "#777777"
+SHADES = ("#b2182b", "#ef8a62", "#7f7f7f", "#1a9850", "#91cf60")
+STYLE: dict[Any, Any] = {
+    "figure.dpi": 110,
+    "savefig.dpi": 150,
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "legend.frameon": False,
+    "axes.titlelocation": "left",
+}
+
+
+def draw_figures(run_dir: Path, policy: Policy) -> list[Path]:
+    """Draws a run's figures into its folder.
+
+    Args:
+      run_dir: with metrics.jsonl.
+      policy: the run's policy.
+
+    Returns:
+      The files written.
+    """
+    figures = run_dir / "figures"
+    figures.mkdir(exist_ok=True)
+    lines = (run_dir / "metrics.jsonl").read_text().splitlines()
+    with plt.rc_context(STYLE):
+        drawn = {
+            "learning_curves.png": learning_curves([[json.loads(line) for line in lines]]),
+            "reward.png": reward_figure(policy.config.task),
+            "rollout.png": rollout_figure(
+                policy_scene(policy), policy.config, {"policy": observing(policy)}
+            ),
+        }
+        for name, figure in drawn.items():
+            figure.savefig(figures / name, bbox_inches="tight")
+            plt.close(figure)
+    return [figures / name for name in drawn]
+
+
+def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
+    """Tilt, falls, reward, loss, epsilon and speed over the decisions.
+
+    Args:
+      runs: the lines of metrics.jsonl of each run. Where a line has values per seed, or
+        there are several runs, a line shows the median and a band the extremes.
+    """
+    panels = (
+        ("train/tilt_deg", "mean body tilt [deg]", "log"),
+        ("train/falls_per_minute", "falls per robot-minute", "symlog"),
+        ("train/reward", "reward per decision", "linear"),
+        ("train/loss", "squared TD error", "log"),
+        ("train/epsilon", "epsilon", "linear"),
+        ("perf/env_steps_per_second", "decisions per second", "linear"),
+    )
+    figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
+    longest = max(runs, key=len)
+    steps = np.asarray([m["env_steps"] for m in longest]) / 1000
+    for axis, (name, title, scale) in zip(axes.flat, panels, strict=True):
+        curves = [curve for run in runs for curve in _seed_curves(run, name)]
+        values = np.full((len(curves), len(steps)), np.nan)
+        for row, curve in zip(values, curves, strict=True):
+            row[: len(curve)] = curve
+        if scale == "log":
+            values = np.where(values > 0, values, np.nan)  # no update yet, no loss
+        shown = np.isfinite(values).any(axis=0)
+        at, values = steps[shown], values[:, shown]
+        if len(values) > 1:
+            low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+            axis.fill_between(at, low, high, color=BLUE, alpha=0.2, lw=0)
+        axis.plot(at, np.nanmedian(values, axis=0), color=BLUE, lw=1.6)
+        axis.set_title(title)
+        axis.set_yscale(scale, **({"linthresh": 0.1} if scale == "symlog" else {}))
+        if name == "train/tilt_deg":
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_formatter("{x:g}")
+        if scale in ("linear", "symlog") and name != "train/reward":
+            axis.set_ylim(bottom=0)
+    for axis in axes[-1]:
+        axis.set_xlabel("thousand decisions")
+    return figure
+
+
+def _seed_curves(run: list[dict[str, Any]], name: str) -> list[list[float]]:
+    """One curve per seed where a run has them, else one."""
+    short = name.removeprefix("train/")
+    if run and short in run[0].get("seeds", {}):
+        return [list(curve) for curve in zip(*(m["seeds"][short] for m in run), strict=True)]
+    return [[m[name] for m in run]]
+
+
+def reward_figure(task: TaskConfig) -> plt.Figure:
+    """The paper's Fig. 4, the reward for the tilt, beside our reading of its Fig. 5."""
+    tilt = np.linspace(0, task.fail_tilt, 301)
+    change = np.linspace(-2, 2, 301)
+    none = np.zeros_like(tilt)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    left.plot(tilt, reward_terms(task, tilt, tilt, none)["level"], color=BLUE, lw=2)
+    left.set_title("instant incline (paper Eq. 4, Fig. 4)")
+    left.set_xlabel("body tilt [deg]")
+    left.set_ylabel("reward")
+    toward = reward_terms(task, change, none, none)["toward"]
+    right.plot(change, np.where(toward >= 0, toward, np.nan), color="#4d9221", lw=2)
+    right.plot(change, np.where(toward <= 0, toward, np.nan), color=ORANGE, lw=2)
+    right.set_title("toward horizontal (our reading of Fig. 5)")
+    right.set_xlabel("tilt before less tilt after [deg]")
+    return figure
+
+
+def rollout_figure(
+    scene: Scene, config: Config, controllers: Mapping[str, Controller], suite: str = "paper"
+) -> plt.Figure:
+    """The paper's Fig. 7: board and body angles over 100 s in plain MuJoCo.
+
+    Args:
+      scene: where.
+      config: the task.
+      controllers: name -> controller, drawn side by side on the same scenario.
+      suite: kind of scenario.
+    """
+    figure, axes = plt.subplots(
+        4,
+        len(controllers),
+        figsize=(max(11, 6.5 * len(controllers)), 7),
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )
+    limit = config.task.max_incline
+    for column, (name, controller) in zip(axes.T, controllers.items(), strict=True):
+        rollout = run_suite(
+            scene, config, controller, suite, 1, RECORD_SECONDS, RECORD_SEED, record=True
+        )
+        assert rollout.qpos is not None
+        qpos = rollout.qpos[0]
+        roll, pitch = roll_pitch(qpos[:, scene.trunk_quat])
+        time = np.arange(1, len(qpos) + 1) * config.task.sim_dt
+        board = np.degrees(qpos[:, scene.board_qpos])
+        rows = (
+            (board[:, 0], "board X", GREY),
+            (board[:, 1], "board Y", GREY),
+            (roll, "body roll", BLUE),
+            (pitch, "body pitch", ORANGE),
+        )
+        for axis, (values, label, colour) in zip(column, rows, strict=True):
+            axis.plot(time, values, color=colour, lw=1.2)
+            if axis in axes[:, 0]:
+                axis.set_ylabel(f"{label} [deg]")
+            axis.set_ylim(-1.05 * limit, 1.05 * limit)
+            axis.axhline(0, color="black", lw=0.5)
+            for change in np.arange(0, time[-1], config.task.target_period):
+                axis.axvline(change, color="black", lw=0.8, ls=":")
+        column[0].set_title(
+            f"{name}: mean tilt {rollout.tilt.mean():.2f} deg, "
+            f"greatest {rollout.tilt.max():.2f} deg"
+            + (", the robot fell" if rollout.fell[0] else "")
+        )
+        column[-1].set_xlabel("time [s]; dotted: the board takes a new target")
+    return figure
+
+
+def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figure:
+    """How often the body is tilted further than so much.
+
+    Args:
+      shares: name -> (len(edges) - 1,) share of the physics steps per bin of tilt.
+      edges: deg.
+    """
+    figure, axis = plt.subplots(figsize=(9, 3.8), layout="constrained")
+    for k, (name, share) in enumerate(shares.items()):
+        beyond = 1 - np.cumsum(share)
+        style = {"color": BLUE, "lw": 2.6} if k == 0 else {"color": SHADES[k - 1], "lw": 1.4}
+        axis.plot(edges[1:], np.where(beyond > 1e-7, beyond, np.nan), label=name, **style)
+    axis.set_yscale("log")
+    axis.set_xscale("log")
+    axis.set_xlim(0.02, edges[-1])
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.set_xlabel("body tilt [deg]")
+    axis.set_title("share of the time that the body is tilted further")
+    axis.legend(loc="lower left")
+    return figure
+
+
+def envelope_figure(envelope: Envelope, limit: float) -> plt.Figure:
+    """Fall rate and mean tilt over incline and board speed, with the physical limits.
+
+    Args:
+      envelope: from `evaluation.envelope`.
+      limit: end of the tilt's colour scale, deg.
+    """
+    figure, axes = plt.subplots(1, 2, figsize=(12, 4.4), sharey=True, layout="constrained")
+    maps = (
+        (envelope.fall_rate, "share of the scenarios with a fall", "Reds", 1.0),
+        (envelope.mean_tilt, "mean body tilt [deg]", "viridis_r", limit),
+    )
+    for axis, (values, title, colours, top) in zip(axes, maps, strict=True):
+        image = axis.pcolormesh(
+            envelope.rates, envelope.inclines, values, cmap=colours, vmin=0, vmax=top
+        )
+        figure.colorbar(image, ax=axis)
+        speeds = [envelope.rates[0], envelope.authority, envelope.authority]
+        axis.plot(speeds, [envelope.reach, envelope.reach, envelope.inclines[0]], "k--", lw=1.8)
+        axis.set_title(title)
+        axis.set_xlabel("board speed on each axis [deg/s]")
+        axis.grid(visible=False)
+    axes[0].set_ylabel("board angle on both axes at once [deg]")
+    return figure

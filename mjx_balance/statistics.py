@@ -1,0 +1,65 @@
+"""Statistics over training seeds."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+CONFIDENCE = 0.95
+RESAMPLES = 10_000
+TILTS = ("mean", "p95", "max")
+
+
+def interquartile_mean(values: Sequence[float]) -> float:
+    """Mean of the middle half, the robust average of Agarwal et al. 2021.
+
+    https://arxiv.org/abs/2108.13264, section 4.3
+    """
+    return float(stats.trim_mean(np.asarray(values, float), 0.25))
+
+
+def interval(values: Sequence[float]) -> tuple[float, float]:
+    """95% percentile bootstrap interval of the interquartile mean.
+
+    A single value, or equal values, is its own interval.
+    """
+    data = np.asarray(values, float)
+    if np.ptp(data) == 0:
+        return float(data[0]), float(data[0])
+    result = stats.bootstrap(
+        (data,),
+        lambda x, axis: stats.trim_mean(x, 0.25, axis=axis),
+        confidence_level=CONFIDENCE,
+        n_resamples=RESAMPLES,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def over_seeds(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Summarises one suite's evaluations, one per training seed.
+
+    Args:
+      results: JSON of `evaluation.summarize`, one per seed.
+
+    Returns:
+      seeds, falls (their sum), scenarios (their sum), and for each of mean, p95 and max the
+      interquartile mean, its interval, and the worst seed's value.
+    """
+    summary: dict[str, Any] = {
+        "seeds": len(results),
+        "scenarios": sum(r["scenarios"] for r in results),
+        "falls": sum(r["falls"] for r in results),
+    }
+    for name in TILTS:
+        values = [r["tilt_deg"][name] for r in results]
+        low, high = interval(values)
+        summary[name] = {
+            "iqm": interquartile_mean(values),
+            "low": low,
+            "high": high,
+            "worst": max(values),
+        }
+    return summary

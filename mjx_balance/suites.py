@@ -1,0 +1,106 @@
+"""The evaluation suites: which boards and circumstances a controller is tried on."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from mjx_balance.config import Config, RandomConfig
+from mjx_balance.task import tilt
+from mjx_balance.task.conditions import DRAWS, Conditions, draw_conditions
+
+
+class SuiteError(ValueError):
+    """A suite that does not exist, or does not suit the config; the message says why."""
+
+
+def authority(config: Config) -> float:
+    """Greatest board speed that the action set can follow on both axes, deg/s.
+
+    `action_max` per decision over the longer of the two half-tracks, fore-aft.
+    """
+    speed = config.task.action_max / config.task.ctrl_dt
+    return math.degrees(speed / max(config.robot.hip_x, config.robot.half_track))
+
+
+def reach(config: Config) -> float:
+    """Greatest incline on both axes at once that the legs' stroke can follow, deg."""
+    lowest, highest = config.robot.height_range
+    height = config.task.body_height
+    room = min(highest - height, height - lowest)
+    return math.degrees(math.atan(room / (config.robot.hip_x + config.robot.half_track)))
+
+
+def _disc(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """Direction uniform, total tilt uniform up to the incline (paper 3.1)."""
+    return tilt.disc_targets(incline[:, None], uniform[..., 0], uniform[..., 1])
+
+
+def _corner(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """Both axes at full incline at once, signs at random: the paper's declared weakness."""
+    return incline[:, None, None] * np.where(uniform < 0.5, -1.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """A kind of scenario."""
+
+    summary: str
+    random: RandomConfig = dataclasses.field(default_factory=RandomConfig)
+    targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
+    """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg."""
+    fast: bool = False
+    """Board speeds uniform from the config's to the authority limit."""
+    steep: bool = False
+    """Inclines uniform from the config's to the reach of the legs."""
+
+
+SUITES: dict[str, Suite] = {
+    "paper": Suite("targets in any direction, up to max_incline (paper 3.1)"),
+    "corner": Suite("both axes at max_incline at once", targets=_corner),
+    "noise": Suite(
+        "IMU noise of a data sheet on every sample",
+        RandomConfig(gyro_noise=0.002, accel_noise=0.023),
+    ),
+    "payload": Suite("0 to 5 kg on the trunk, off its centre", RandomConfig(payload=5.0)),
+    "friction": Suite(
+        "foot friction from 0.4 to 1.0", RandomConfig(friction_min=0.4, friction_max=1.0)
+    ),
+    "gains": Suite("servo gains off by up to 20%", RandomConfig(gain_spread=0.2)),
+    "latency": Suite("every action one decision late", RandomConfig(latency_share=1.0)),
+    "fast": Suite("board speeds up to what the action set can follow", fast=True),
+    "steep": Suite("inclines up to what the legs can reach", steep=True),
+}
+"""By the names of `mjx-balance evaluate --suite`."""
+
+
+def find_suite(name: str) -> Suite:
+    """Returns the suite called `name`; raises `SuiteError` with the known names."""
+    if name not in SUITES:
+        raise SuiteError(f"unknown suite {name!r}; known suites: {', '.join(SUITES)}")
+    return SUITES[name]
+
+
+def make_scenarios(
+    config: Config, suite: str, scenarios: int, duration: float, seed: int
+) -> tuple[tilt.Scenario, Conditions]:
+    """Draws a suite's scenarios and the circumstances they happen in.
+
+    Scenario k of a seed is the same however many are drawn.
+
+    Raises:
+      SuiteError: for an unknown suite.
+    """
+    chosen, task = find_suite(suite), config.task
+    count = tilt.num_targets(task, duration)
+    rngs = [np.random.default_rng((seed, k)) for k in range(scenarios)]
+    uniform = np.asarray([rng.uniform(size=(count, 2)) for rng in rngs])
+    others = np.asarray([rng.uniform(size=DRAWS + 2) for rng in rngs])
+    rate, incline = np.full(scenarios, task.board_rate), np.full(scenarios, task.max_incline)
+    if chosen.fast:
+        rate += np.maximum(authority(config) - task.board_rate, 0) * others[:, DRAWS]
+    if chosen.steep:
+        incline += np.maximum(reach(config) - task.max_incline, 0) * others[:, DRAWS + 1]
+    scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
+    return scenario, draw_conditions(chosen.random, config.robot, others[:, :DRAWS])

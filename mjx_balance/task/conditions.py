@@ -1,0 +1,59 @@
+"""What may differ from one robot and board to the next: noise, payload, friction, gains, delay."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_balance.config import RandomConfig, RobotConfig
+from mjx_balance.task import Array
+
+DRAWS = 6
+"""Uniform random numbers that one world's conditions take."""
+
+
+class Conditions(NamedTuple):
+    """The circumstances of one world, or of a batch of them."""
+
+    imu_noise: Array
+    """(..., 6) standard deviation of every IMU sample, rad/s and m/s^2."""
+    payload: Array
+    """(...) mass carried on the trunk, kg."""
+    payload_at: Array
+    """(..., 3) where, in the trunk's frame, m."""
+    friction: Array
+    """(...) sliding friction of the feet."""
+    gain: Array
+    """(...) factor on the leg servos' position gain."""
+    latency: Array
+    """(...) decisions between choosing an action and taking it, 0 or 1."""
+
+
+def draw_conditions(random: RandomConfig, robot: RobotConfig, uniform: Array) -> Conditions:
+    """Turns random numbers into conditions.
+
+    Args:
+      random: the ranges; those of the preset `paper` leave everything as it is.
+      robot: the nominal friction.
+      uniform: (..., DRAWS) in [0, 1).
+
+    Returns:
+      Conditions with the leading dimensions of `uniform`.
+    """
+    xp = uniform.__array_namespace__()
+    u = xp.moveaxis(uniform, -1, 0)
+    sigma = np.asarray([random.gyro_noise] * 3 + [random.accel_noise] * 3, uniform.dtype)
+    offset = random.payload_offset
+    at = xp.stack(
+        (offset * (2 * u[1] - 1), offset * (2 * u[2] - 1), 0 * u[0] + random.payload_height),
+        axis=-1,
+    )
+    friction_min = robot.foot_friction if random.friction_min is None else random.friction_min
+    friction_max = robot.foot_friction if random.friction_max is None else random.friction_max
+    return Conditions(
+        imu_noise=xp.zeros_like(u[0])[..., None] + sigma,
+        payload=random.payload * u[0],
+        payload_at=at,
+        friction=friction_min + (friction_max - friction_min) * u[3],
+        gain=1 + random.gain_spread * (2 * u[4] - 1),
+        latency=(u[5] < random.latency_share).astype(uniform.dtype),
+    )

@@ -1,0 +1,179 @@
+"""The HTML report: complete, honest about what is missing, and quiet in a browser."""
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from mjx_balance import report
+from mjx_balance.cli import main
+from mjx_balance.config import Config, to_dict
+from mjx_balance.policy import make_manifest, save_policy
+from mjx_balance.scene import Scene
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def metrics_line(k: int, seeds: int) -> dict[str, Any]:
+    names = "tilt_deg falls_per_minute reward loss epsilon".split()
+    line: dict[str, Any] = {"env_steps": 1024 * (k + 1), "gradient_steps": k}
+    line |= {f"train/{name}": 1 / (k + 1) for name in names}
+    line |= {"perf/env_steps_per_second": 500.0, "perf/physics_steps_per_second": 25_000.0}
+    if seeds > 1:
+        values = [(n + 1) / (k + 1) for n in range(seeds)]
+        line["seeds"] = dict.fromkeys(("tilt_deg", "reward", "loss"), values)
+    return line
+
+
+def evaluation_result(suite: str, tilt: float) -> dict[str, Any]:
+    keys = ("mean", "rms", "p50", "p95", "p99", "max")
+    return {"suite": suite, "scenarios": 8, "falls": 1, "tilt_deg": dict.fromkeys(keys, tilt)}
+
+
+@pytest.fixture(scope="module")
+def run(config: Config, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder of two seeds with everything in it; the policy is untrained."""
+    folder = tmp_path_factory.mktemp("report") / "run"
+    folder.mkdir()
+    config = dataclasses.replace(config, num_seeds=2)
+    (folder / "config.json").write_text(json.dumps(to_dict(config)))
+    lines = [json.dumps(metrics_line(k, 2)) for k in range(8)]
+    (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    results = {suite: evaluation_result(suite, 0.1) for suite in ("paper", "corner")}
+    (folder / "evaluation.json").write_text(json.dumps(results))
+    statistics = {
+        suite: report.over_seeds([evaluation_result(suite, t) for t in (0.1, 0.2)])
+        for suite in ("paper", "corner")
+    }
+    (folder / "seeds.json").write_text(json.dumps({"statistics": statistics}))
+    layers: dict[str, Any] = {
+        name: {"kernel": np.zeros((a, b)), "bias": np.zeros(b)}
+        for name, a, b in (("hidden_0", 34, 64), ("hidden_1", 64, 64), ("head", 98, 3))
+    }
+    layers |= {"profile": np.zeros(4), "stretch": np.zeros(2)}
+    manifest = make_manifest(config, scene.hash, (21, 21), {})
+    save_policy(folder / "policy.safetensors", {"params": layers}, manifest)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(run: Path) -> Path:
+    """The report on that folder, by the command."""
+    shorter = {"DURATION": 3.0, "ENVELOPE_SCENARIOS": 1, "ENVELOPE_DURATION": 1.0}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (shorter | {"VIDEO_SECONDS": 1.0}).items():
+            patch.setattr(report, name, value)
+        assert main(("report", str(run), "--scenarios", "2")) == 0
+    return run / "report.html"
+
+
+def test_everything_is_there(page: Path) -> None:
+    text = page.read_text()
+    titles = re.findall(r"<h2>(.*?)</h2>", text)
+    expected = (
+        "Against the baselines|Over the training seeds|100 s on the board: paper|"
+        "100 s on the board: corner|Tilt distribution|Envelope|Video|Learning curves|"
+        "Reward (Fig. 4 and 5 of the paper)|Config|Reproduce"
+    )
+    assert titles == expected.split("|"), "nothing is missing"
+    for name in ("none", "pd-imu", "pd-attitude", "rate-oracle", "clairvoyant"):
+        assert f"<b>{name}</b>" in text
+    assert "mjx-balance train --preset default --seed 0 --num-seeds 2" in text
+    assert text.count("data:image/png;base64,") == 6
+    assert "data:video/mp4;base64," in text
+
+
+def test_the_page_needs_nothing_from_elsewhere(page: Path) -> None:
+    text = re.sub(r'"data:[^"]*"', '""', page.read_text())
+    assert not re.findall(r"(?:src|href)=\"[^\"]+\"", text)
+    assert "http" not in text
+    assert "<script" not in text
+
+
+def test_measurements_are_kept_and_read_back(run: Path, page: Path) -> None:
+    data = json.loads((run / "report.json").read_text())
+    for suites in data["results"].values():
+        assert {r["scenarios"] for r in suites.values()} == {2}
+    for suites in data["histogram"].values():
+        for share in suites.values():
+            assert sum(share) == pytest.approx(1.0)
+
+
+def test_an_incomplete_folder_says_what_is_missing_and_shows_the_rest(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    half = tmp_path / "half"
+    half.mkdir()
+    shutil.copy(run / "config.json", half)
+    shutil.copy(run / "metrics.jsonl", half)
+    (half / "evaluation.json").write_text("{ torn")
+    assert main(("report", str(half))) == 0
+    said = capsys.readouterr().err
+    assert "policy.safetensors is missing" in said
+    assert "evaluation.json cannot be used" in said
+    text = (half / "report.html").read_text()
+    assert "policy.safetensors is missing" in text
+    assert "<h2>Learning curves</h2>" in text
+    assert "<h2>Config</h2>" in text
+
+
+def test_a_foreign_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "holiday.jpg").write_bytes(b"\xff\xd8")
+    assert main(("report", str(tmp_path))) == 2
+    assert "is no run folder" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["holiday.jpg"]
+
+
+def browse(browser: str, page: str, folder: Path) -> tuple[str, set[str], Path]:
+    """Opens a page; returns what the browser logs, the addresses it asks for, a picture."""
+    shot, log = folder / "page.png", folder / "net.json"
+    flags = (
+        "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync "
+        "--disable-background-networking --disable-component-update --hide-scrollbars "
+        "--enable-logging=stderr --window-size=1280,2400 --virtual-time-budget=8000"
+    ).split()
+    files = [f"--user-data-dir={folder / 'profile'}", f"--log-net-log={log}"]
+    done = subprocess.run(
+        [browser, *flags, *files, f"--screenshot={shot}", page],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    asked = set(re.findall(r'"url":"(https?://[^"?]*)', log.read_text()))
+    return done.stderr, asked, shot
+
+
+@pytest.mark.browser
+def test_a_browser_shows_it_without_errors_or_requests(page: Path, tmp_path: Path) -> None:
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip("no Chromium on this machine; Debian's package is chromium")
+    said, asked, shot = browse(browser, page.as_uri(), tmp_path)
+    assert "CONSOLE" not in said, said
+    # Chromium itself asks its maker for the time and the like, whatever it shows.
+    own = {address for address in asked if ".google.com/" in address}
+    assert asked == own, asked - own
+    picture = np.asarray(imageio.imread(shot))
+    assert picture.shape[:2] == (2400, 1280)
+    assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 500, "it is not blank"
+
+
+@pytest.mark.browser
+def test_the_browser_check_can_fail(tmp_path: Path) -> None:
+    """A page that asks for a picture and throws is noticed."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip("no Chromium on this machine; Debian's package is chromium")
+    bad = tmp_path / "bad.html"
+    bad.write_text("<img src='http://127.0.0.1:9/x.png'><script>throw Error('boo')</script>")
+    said, asked, _ = browse(browser, bad.as_uri(), tmp_path)
+    assert "CONSOLE" in said
+    assert "http://127.0.0.1:9/x.png" in asked
