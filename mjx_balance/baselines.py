@@ -81,7 +81,7 @@ class Stand:
 class AttitudePD:
     """Proportional and derivative control on the true attitude and angular rate."""
 
-    def __init__(self, scene: Scene, config: Config, proportional: float = 0.9, rate: float = 0.16):
+    def __init__(self, scene: Scene, config: Config, proportional: float = 1.1, rate: float = 0.14):
         """Takes the gains.
 
         Args:
@@ -119,10 +119,10 @@ class ImuPD(AttitudePD):
         self,
         scene: Scene,
         config: Config,
-        proportional: float = 0.9,
+        proportional: float = 1.0,
         rate: float = 0.16,
-        tau: float = 0.2,
-        samples: int = 6,
+        tau: float = 4.0,
+        samples: int = 1,
     ):
         """Takes the gains; `tau` in s, and the gyro samples averaged for the rate."""
         super().__init__(scene, config, proportional, rate)

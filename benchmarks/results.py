@@ -1,0 +1,169 @@
+"""Measures policies and baselines on every suite and writes the README's tables.
+
+Every evaluation is kept in `--out` as soon as it is done, under the policy's
+fingerprint, so that an interrupted run goes on where it stopped. `--write` puts the
+tables between the markers of a Markdown file.
+
+    python benchmarks/results.py policies/seeds/*.safetensors --write README.md
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from mjx_balance import load_policy
+from mjx_balance.baselines import CONTROLLERS, make_controller
+from mjx_balance.display import Display
+from mjx_balance.evaluation import (
+    Controller,
+    Envelope,
+    envelope,
+    observing,
+    policy_scene,
+    run_suite,
+    summarize,
+)
+from mjx_balance.policy import Policy
+from mjx_balance.statistics import TILTS, over_seeds
+from mjx_balance.suites import SUITES
+
+SEED = 7_000_000
+DURATION = 60.0
+MAIN = ("paper", "corner")
+ENVELOPE_SCENARIOS, ENVELOPE_DURATION = 2, 30.0
+BEGIN, END = "<!-- results: written by benchmarks/results.py -->", "<!-- end of results -->"
+
+
+def measured(
+    out: Path, key: str, title: str, measure: Callable[[Any], dict[str, Any]]
+) -> dict[str, Any]:
+    """Reads a result from `out`, or measures it and adds it there."""
+    known = json.loads(out.read_text()) if out.is_file() else {}
+    if key not in known:
+        with Display(Console(stderr=True)).bar(title) as bar:
+            known[key] = measure(bar)
+        part = out.with_suffix(".part")
+        part.write_text(json.dumps(known, indent=1) + "\n")
+        part.replace(out)
+    return known[key]
+
+
+def suite_result(
+    out: Path,
+    name: str,
+    policy: Policy,
+    make: Callable[[], Controller],
+    suite: str,
+    scenarios: int,
+) -> dict[str, Any]:
+    """Evaluates one controller on one suite."""
+    scene = policy_scene(policy)
+
+    def measure(bar: Any) -> dict[str, Any]:
+        rollout = run_suite(scene, policy.config, make(), suite, scenarios, DURATION, SEED, bar)
+        return summarize(rollout, suite, DURATION, SEED)
+
+    key = f"{name} {scene.hash} ramp {policy.config.task.action_ramp} {suite} {scenarios}"
+    return measured(out, key, f"{name}, {suite}, {scenarios} scenarios", measure)
+
+
+def suite_table(
+    networks: dict[str, list[dict[str, Any]]], baselines: dict[str, dict[str, dict[str, Any]]]
+) -> list[str]:
+    """One row per suite: the networks over their seeds, the baselines' mean tilt and falls."""
+    names = [name for name in CONTROLLERS if name != "none"]
+    lines = [
+        "| suite | falls | mean tilt deg | p95 | max | worst seed | "
+        + " | ".join(f"`{name}`" for name in names)
+        + " |",
+        "|---" * (6 + len(names)) + "|",
+    ]
+    for suite, results in networks.items():
+        row = over_seeds(results)
+        cells = [f"`{suite}`", f"{row['falls']} of {row['scenarios']:,}"]
+        cells += [f"{row[x]['iqm']:.3f} [{row[x]['low']:.3f}, {row[x]['high']:.3f}]" for x in TILTS]
+        cells.append(" / ".join(f"{row[x]['worst']:.3f}" for x in TILTS))
+        for name in names:
+            result = baselines[name][suite]
+            fell = f" ({result['falls']} fall)" if result["falls"] else ""
+            cells.append(f"{result['tilt_deg']['mean']:.3f}{fell}")
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def main() -> None:
+    """Measures what is missing and prints the tables."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("policies", nargs="+")
+    parser.add_argument("--scenarios", type=int, default=2000, help="of suites paper and corner")
+    parser.add_argument("--others", type=int, default=500, help="of the other suites")
+    parser.add_argument("--baselines", type=int, default=256, help="of every suite")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results.json"))
+    parser.add_argument("--write", type=Path, help="Markdown file with markers")
+    args = parser.parse_args()
+    policies = [load_policy(path) for path in args.policies]
+    first = policies[0]
+    scene, config = policy_scene(first), first.config
+    networks: dict[str, list[dict[str, Any]]] = {}
+    baselines: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in CONTROLLERS}
+    for suite in SUITES:
+        count = args.scenarios if suite in MAIN else args.others
+        networks[suite] = [
+            suite_result(
+                args.out,
+                f"policy {policy.fingerprint}",
+                policy,
+                lambda policy=policy: observing(policy),
+                suite,
+                count,
+            )
+            for policy in policies
+        ]
+        for name in CONTROLLERS:
+            baselines[name][suite] = suite_result(
+                args.out,
+                name,
+                first,
+                lambda name=name: make_controller(name, scene, config),
+                suite,
+                args.baselines,
+            )
+    shares = []
+    for policy in policies:
+
+        def measure(bar: Any, policy: Policy = policy) -> dict[str, Any]:
+            found = envelope(
+                scene, config, observing(policy), ENVELOPE_SCENARIOS, ENVELOPE_DURATION, SEED, bar
+            )
+            return vars(found)
+
+        key = f"envelope {policy.fingerprint} {ENVELOPE_SCENARIOS}"
+        shares.append(Envelope(**measured(args.out, key, "envelope", measure)).fall_free_share)
+    settled = max(r["action_mm_settled"] for suite in MAIN for r in networks[suite])
+    text = "\n".join(
+        [
+            BEGIN,
+            *suite_table(networks, baselines),
+            "",
+            f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval); "
+            f"{args.scenarios:,} scenarios of {DURATION:g} s per seed in `paper` and `corner`, "
+            f"{args.others:,} in the others, {args.baselines:,} for the baselines, which are shown "
+            "by their mean tilt; seeds that training never sees. Fall-free share of the feasible "
+            f"envelope: {min(shares):.2f} (worst seed). Commanded action while the board rests: "
+            f"at most {settled:.3f} mm.",
+            END,
+        ]
+    )
+    print(text)
+    if args.write:
+        page = args.write.read_text()
+        head, rest = page.split(BEGIN)
+        args.write.write_text(head + text + rest.split(END)[1])
+
+
+if __name__ == "__main__":
+    main()
