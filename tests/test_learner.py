@@ -169,7 +169,7 @@ def test_learns_with_whitening_and_then_keeps_it() -> None:
     state = trained(learner)
     assert float(state.inputs.batches) == 100
     for obs in (-0.8, 0.3):
-        np.testing.assert_allclose(values(learner, state, obs), (-obs, obs), atol=0.1)
+        np.testing.assert_allclose(values(learner, state, obs), (-obs, obs), atol=0.2)
 
 
 def test_dither_moves_each_digit_by_a_few_levels() -> None:

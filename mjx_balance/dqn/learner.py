@@ -367,9 +367,8 @@ class Learner:
         return jnp.mean(error**2)
 
     def _q_values(self, params: Params, whiten: Any, obs: jax.Array) -> jax.Array:
-        if whiten is not None:
-            mean, matrix = whiten
-            obs = (obs - mean) @ matrix
+        if whiten is not None:  # the small kernel instead of every observation
+            params = fold_inputs(params, *whiten)
         values = self.network.apply(params, obs)
         assert isinstance(values, jax.Array)
         return values
