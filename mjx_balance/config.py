@@ -320,6 +320,13 @@ def preset(name: str) -> Config:
     return PRESETS[name]
 
 
+def greatest_incline(task: TaskConfig, robot: RobotConfig) -> float:
+    """Board angle on both axes at once that the legs' stroke can follow, deg."""
+    lowest, highest = robot.height_range
+    room = min(highest - task.body_height, task.body_height - lowest)
+    return math.degrees(math.atan(room / (robot.hip_x + robot.half_track)))
+
+
 def check(config: Config) -> Config:
     """Returns `config` if it can be run; raises `ConfigError` with one sentence if not."""
     task, robot, random, dqn = config.task, config.robot, config.random, config.dqn
@@ -364,31 +371,38 @@ def check(config: Config) -> Config:
         lags = getattr(task, name)
         if not lags or min(lags) < 0:
             raise ConfigError(f"{name} is {lags}; it must hold at least one lag, none negative")
-    ramp = 2 * task.max_incline / task.board_rate
+    steepest = task.max_incline if random.incline_max is None else random.incline_max
+    ramp = 2 * steepest / task.board_rate
     if ramp > task.target_period:
         raise ConfigError(
-            f"target_period is {task.target_period} s, but a board ramp may last "
-            f"2 * max_incline / board_rate = {ramp:g} s; the period must not be shorter"
+            f"target_period is {task.target_period} s, but a board ramp may last twice the "
+            f"greatest incline over board_rate, {ramp:g} s; the period must not be shorter"
         )
+    for name, least, most in (
+        ("friction", random.friction_min, random.friction_max),
+        ("rate", task.board_rate, random.rate_max),
+        ("incline", task.max_incline, random.incline_max),
+    ):
+        if least is not None and most is not None and most < least:
+            raise ConfigError(
+                f"{name}_max is {most}; it must not be less than the least {name}, {least}"
+            )
     if not 0 < task.fail_tilt < 90:
         raise ConfigError(f"fail_tilt is {task.fail_tilt}; it must lie between 0 and 90 deg")
     if task.max_incline >= 45:
         raise ConfigError(f"max_incline is {task.max_incline}; it must be less than 45 deg")
     lowest, highest = robot.height_range
-    slope = math.tan(math.radians(task.max_incline))
-    stroke = slope * (robot.hip_x + robot.half_track)
-    room = min(highest - task.body_height, task.body_height - lowest)
-    if room <= 0:
+    limit = greatest_incline(task, robot)
+    if limit <= 0:
         raise ConfigError(
             f"body_height is {task.body_height} m; the legs reach from {lowest:.3f} to "
             f"{highest:.3f} m"
         )
-    if stroke > room:
-        limit = math.degrees(math.atan(room / (robot.hip_x + robot.half_track)))
+    if steepest > limit:
+        name = "max_incline" if random.incline_max is None else "incline_max"
         raise ConfigError(
-            f"max_incline is {task.max_incline} deg; on both axes at once it asks the legs for "
-            f"{stroke * 1000:.0f} mm, but from body_height {task.body_height} m they have "
-            f"{room * 1000:.0f} mm: at most {limit:.1f} deg"
+            f"{name} is {steepest} deg; on both axes at once the legs, from body_height "
+            f"{task.body_height} m, reach at most {limit:.1f} deg"
         )
     if not dqn.hidden_sizes or min(dqn.hidden_sizes) < 1:
         raise ConfigError(f"hidden_sizes is {dqn.hidden_sizes}; it must hold positive widths")

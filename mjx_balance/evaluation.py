@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from mujoco.batch import Batch
 
-from mjx_balance.config import Config, RandomConfig
+from mjx_balance.config import Config, RandomConfig, greatest_incline
 from mjx_balance.plant import View, decision_ctrl, observation, standing_heights
 from mjx_balance.policy import Policy, PolicyError
 from mjx_balance.scene import Scene, load_scene, model_fields
-from mjx_balance.suites import authority, find_suite, make_scenarios, reach
+from mjx_balance.suites import authority, find_suite, make_scenarios
 from mjx_balance.task import tilt
 from mjx_balance.task.actions import action_table, apply_action, nearest_action
 from mjx_balance.task.conditions import Conditions
@@ -285,7 +285,7 @@ class Envelope:
     authority: float
     """Speed beyond which the action set cannot follow, deg/s (`suites.authority`)."""
     reach: float
-    """Incline beyond which the legs are too short, deg (`suites.reach`)."""
+    """Incline beyond which the legs are too short, deg (`config.greatest_incline`)."""
     scenarios: int
     """Per cell."""
     duration_s: float
@@ -333,7 +333,7 @@ def envelope(
         fall_rate=rollout.fell.reshape(shape).mean(axis=-1).tolist(),
         mean_tilt=rollout.tilt.mean(axis=-1).reshape(shape).mean(axis=-1).tolist(),
         authority=authority(config),
-        reach=reach(config),
+        reach=greatest_incline(config.task, config.robot),
         scenarios=scenarios,
         duration_s=duration,
         seed=seed,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_balance.config import Config, RandomConfig
+from mjx_balance.config import Config, RandomConfig, greatest_incline
 from mjx_balance.task import tilt
 from mjx_balance.task.conditions import DRAWS, Conditions, draw_conditions
 
@@ -22,14 +22,6 @@ def authority(config: Config) -> float:
     """
     speed = config.task.action_max / config.task.ctrl_dt
     return math.degrees(speed / max(config.robot.hip_x, config.robot.half_track))
-
-
-def reach(config: Config) -> float:
-    """Greatest incline on both axes at once that the legs' stroke can follow, deg."""
-    lowest, highest = config.robot.height_range
-    height = config.task.body_height
-    room = min(highest - height, height - lowest)
-    return math.degrees(math.atan(room / (config.robot.hip_x + config.robot.half_track)))
 
 
 def _disc(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
@@ -101,6 +93,7 @@ def make_scenarios(
     if chosen.fast:
         rate += np.maximum(authority(config) - task.board_rate, 0) * others[:, DRAWS]
     if chosen.steep:
-        incline += np.maximum(reach(config) - task.max_incline, 0) * others[:, DRAWS + 1]
+        steepest = greatest_incline(task, config.robot)
+        incline += np.maximum(steepest - task.max_incline, 0) * others[:, DRAWS + 1]
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     return scenario, draw_conditions(chosen.random, config.robot, others[:, :DRAWS])

@@ -10,6 +10,7 @@ from mjx_balance.config import (
     PRESETS,
     Config,
     ConfigError,
+    RandomConfig,
     RobotConfig,
     TaskConfig,
     check,
@@ -76,6 +77,14 @@ def test_reach_of_the_legs_at_the_knee_limits() -> None:
         ("task", {"reward_fail": float("nan")}, ("reward_fail is nan",)),
         ("task", {"square_share": -0.1}, ("square_share is -0.1",)),
         ("robot", {"total_mass": float("inf")}, ("total_mass is inf",)),
+        ("task", {"reward_tilt": "middle"}, ("reward_tilt is 'middle'", "end, mean")),
+        ("random", {"payload": -1.0}, ("payload is -1.0",)),
+        ("random", {"friction_min": 0.9, "friction_max": 0.8}, ("friction_max is 0.8", "0.9")),
+        ("random", {"rate_max": 3.0}, ("rate_max is 3.0", "3.5")),
+        ("random", {"incline_max": 11.0}, ("incline_max is 11.0", "10.3 deg")),
+        ("random", {"latency_share": 1.1}, ("latency_share is 1.1",)),
+        ("dqn", {"head": "round"}, ("head is 'round'", "radial")),
+        ("dqn", {"dither": -1}, ("dither is -1",)),
         ("dqn", {"gamma": 1.5}, ("gamma is 1.5",)),
         ("dqn", {"learning_rate": float("nan")}, ("learning_rate is nan",)),
         ("dqn", {"batch_size": 0}, ("batch_size is 0",)),
@@ -93,6 +102,16 @@ def test_impossible_config_is_refused(
         check(changed(section, **values))
     for word in words:
         assert word in str(caught.value)
+
+
+def test_nothing_is_random_in_the_paper() -> None:
+    assert preset("paper").random == RandomConfig()
+    assert preset("default").random == RandomConfig()
+
+
+def test_preset_best_sees_every_sample_since_the_last_decision() -> None:
+    task = preset("best").task
+    assert task.gyro_lags == task.accel_lags == tuple(range(task.sim_steps))
 
 
 def test_a_ramp_may_fill_its_whole_period() -> None:

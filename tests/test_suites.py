@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_balance.config import Config
-from mjx_balance.suites import SUITES, authority, make_scenarios, reach
+from mjx_balance.config import Config, greatest_incline
+from mjx_balance.suites import SUITES, authority, make_scenarios
 
 
 def test_scenarios_depend_on_the_seed_and_not_on_their_number(config: Config) -> None:
@@ -32,7 +32,8 @@ def test_paper_fills_the_disc_and_corner_its_corners(config: Config) -> None:
 def test_authority_and_reach_by_hand(config: Config) -> None:
     """15 mm/s over 193 mm, and 61 mm of leg over 335 mm."""
     assert authority(config) == pytest.approx(np.degrees(0.015 / 0.193))
-    assert reach(config) == pytest.approx(np.degrees(np.arctan(0.061 / 0.335)), abs=0.2)
+    reach = greatest_incline(config.task, config.robot)
+    assert reach == pytest.approx(np.degrees(np.arctan(0.061 / 0.335)), abs=0.2)
 
 
 def test_fast_and_steep_stay_within_what_can_be_followed(config: Config) -> None:
@@ -41,7 +42,7 @@ def test_fast_and_steep_stay_within_what_can_be_followed(config: Config) -> None
     assert 4.4 < fast.rate.max() <= authority(config)
     steep, _ = make_scenarios(config, "steep", 400, 60, 0)
     size = np.linalg.norm(steep.targets, axis=-1).max(axis=-1)
-    assert 7 < size.max() <= reach(config)
+    assert 7 < size.max() <= greatest_incline(config.task, config.robot)
 
 
 @pytest.mark.parametrize(

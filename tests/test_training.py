@@ -99,6 +99,40 @@ def test_an_interrupted_and_resumed_run_equals_an_uninterrupted_one(
     assert steps == list(range(1024, 6145, 1024))
 
 
+def test_several_seeds_leave_a_policy_each_and_the_best_one(
+    cache: dict[str, str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    flags = "--preset smoke --num-env-steps 2048 --eval-scenarios 4 --eval-duration 5".split()
+    process = start(cache, *flags, "--num-seeds", "2", "--seed", "3", "--run-dir", str(folder))
+    out, err = process.communicate()
+    assert process.returncode == 0, out + err
+    seeds = json.loads((folder / "seeds.json").read_text())
+    assert [row["seed"] for row in seeds["seeds"]] == [3, 4]
+    names = {f"seed-{row['seed']}.safetensors" for row in seeds["seeds"]}
+    assert {p.name for p in (folder / "seeds").iterdir()} == names
+    each = [load_policy(folder / "seeds" / name) for name in sorted(names)]
+    obs = np.random.default_rng(0).normal(size=(5, each[0].observation_size))
+    assert not np.array_equal(each[0].q_values(obs), each[1].q_values(obs))
+
+    def score(row) -> tuple[int, float]:
+        suites = row["validation"].values()
+        return sum(r["falls"] for r in suites), sum(r["tilt_deg"]["mean"] for r in suites)
+
+    best = min(seeds["seeds"], key=score)
+    assert seeds["best"] == best["seed"]
+    chosen = load_policy(folder / "policy.safetensors")
+    assert chosen.fingerprint == each[best["seed"] - 3].fingerprint
+    assert chosen.config.seed == best["seed"]
+    results = json.loads((folder / "evaluation.json").read_text())
+    assert results == best["evaluation"]
+    assert results["paper"]["seed"] != best["validation"]["paper"]["seed"]
+    assert seeds["statistics"]["corner"]["seeds"] == 2
+    line = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
+    assert len(line["seeds"]["tilt_deg"]) == 2
+    assert line["train/tilt_deg"] == pytest.approx(np.mean(line["seeds"]["tilt_deg"]))
+
+
 def test_a_second_start_compiles_nothing(run: Path, cache: dict[str, str], tmp_path: Path) -> None:
     """Tracing and compiling MJX takes a minute; from the cache, seconds."""
     process = start(cache, *FLAGS, "--run-dir", str(tmp_path / "run"))
