@@ -10,6 +10,7 @@ import argparse
 import copy
 import dataclasses
 
+import mujoco
 import numpy as np
 
 from mjx_balance import evaluation, load_policy
@@ -21,10 +22,26 @@ from mjx_balance.suites import make_scenarios
 LINE_SEARCH_ITERATIONS = 6  # as in training
 VARIANTS: dict[str, dict[str, float]] = {
     "as shipped": {},
-    "1 Newton iteration": {"iterations": 1},
-    "2 Newton iterations": {"iterations": 2},
-    "4 Newton iterations": {"iterations": 4},
+    "pyramidal cones": {"cone": mujoco.mjtCone.mjCONE_PYRAMIDAL},
+    "pyramidal cones, 4 Newton iterations (training)": {
+        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+        "iterations": 4,
+    },
+    "pyramidal cones, 2 Newton iterations": {
+        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+        "iterations": 2,
+    },
+    "pyramidal cones, 1 Newton iteration": {
+        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+        "iterations": 1,
+    },
+    "elliptic cones, 4 Newton iterations": {"iterations": 4},
     "impratio 1, contact time 20 ms": {"impratio": 1.0, "contact_time": 0.02},
+    "foot friction 0.4": {"friction": 0.4},
+    "foot friction 0.4, pyramidal cones": {
+        "friction": 0.4,
+        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    },
 }
 
 
@@ -34,6 +51,10 @@ def varied(scene: Scene, changes: dict[str, float]) -> Scene:
     if "iterations" in changes:
         changed.opt.iterations = int(changes["iterations"])
         changed.opt.ls_iterations = LINE_SEARCH_ITERATIONS
+    if "cone" in changes:
+        changed.opt.cone = int(changes["cone"])
+    if "friction" in changes:
+        changed.pair_friction[:, :2] = changes["friction"]
     if "impratio" in changes:
         changed.opt.impratio = changes["impratio"]
     if "contact_time" in changes:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from mujoco import mjx
 
 from mjx_balance.scene import Scene
@@ -59,6 +60,8 @@ def initial_state(scene: Scene) -> PhysicsState:
 def mjx_advance(scene: Scene) -> Advance:
     """Puts the scene's model on the device and returns its `Advance` for one world."""
     training_model = copy.copy(scene.model)
+    # With elliptic cones the solver does not converge in so few iterations.
+    training_model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     training_model.opt.iterations = SOLVER_ITERATIONS
     training_model.opt.ls_iterations = LINE_SEARCH_ITERATIONS
     with jax.ensure_compile_time_eval():  # constants, even where this runs inside a trace
