@@ -441,6 +441,14 @@ def to_dict(config: Any) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
+def flatten(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of `to_dict`'s values without their sections; no two have one name."""
+    flat = {}
+    for name, value in values.items():
+        flat |= flatten(value) if isinstance(value, dict) else {name: value}
+    return flat
+
+
 def from_dict(kind: type[T], values: Mapping[str, Any]) -> T:
     """Rebuilds the config section `kind` from `to_dict`'s values.
 

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from mjx_balance import figures, render
 from mjx_balance.baselines import CONTROLLERS, make_controller
-from mjx_balance.config import Config, check, from_dict, preset, to_dict
+from mjx_balance.config import Config, check, flatten, from_dict, preset, to_dict
 from mjx_balance.evaluation import (
     Controller,
     Envelope,
@@ -405,7 +405,7 @@ def _reward_caption(config: Config) -> str:
 
 def _config(config: Config) -> str:
     """What differs from the paper's preset, and everything."""
-    ours, papers = (_flat(to_dict(c)) for c in (config, preset("paper")))
+    ours, papers = (flatten(to_dict(c)) for c in (config, preset("paper")))
     rows = "".join(
         f"<tr><td><code>{name}</code></td><td>{html.escape(str(papers[name]))}</td>"
         f"<td>{html.escape(str(value))}</td></tr>"
@@ -418,16 +418,6 @@ def _config(config: Config) -> str:
         f"<th>this run</th></tr></thead><tbody>{rows}</tbody></table><details><summary>every field"
         f"</summary><pre>{everything}</pre></details></section>"
     )
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat = {}
-    for name, value in values.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
 
 
 def _reproduce(runs: list[Run], config: Config | None, out: Path) -> str:

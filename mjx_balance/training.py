@@ -19,7 +19,7 @@ from tensorboardX import SummaryWriter
 
 from mjx_balance import evaluation, figures, report
 from mjx_balance.checkpoint import Checkpoints
-from mjx_balance.config import Config, ConfigError, check, from_dict, to_dict
+from mjx_balance.config import Config, ConfigError, check, flatten, from_dict, to_dict
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.dqn.networks import QNetwork
@@ -138,7 +138,7 @@ def check_same_config(saved: Config, wanted: Config, path: Path) -> None:
     Raises:
       RunFolderError: naming the first field that differs.
     """
-    before, after = _flatten(to_dict(saved)), _flatten(to_dict(wanted))
+    before, after = flatten(to_dict(saved)), flatten(to_dict(wanted))
     for name, value in after.items():
         if before[name] != value:
             raise RunFolderError(
@@ -493,10 +493,3 @@ def _drop_metrics_after(path: Path, env_steps: int) -> None:
         lines = path.read_text().splitlines()
         kept = [x for x in lines if json.loads(x)["env_steps"] <= env_steps]
         path.write_text("".join(f"{x}\n" for x in kept))
-
-
-def _flatten(values: dict[str, Any]) -> dict[str, Any]:
-    flat = {}
-    for name, value in values.items():
-        flat |= _flatten(value) if isinstance(value, dict) else {name: value}
-    return flat
