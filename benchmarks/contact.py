@@ -1,4 +1,4 @@
-"""What the contact model and the solver's accuracy do to the robot. Plain MuJoCo, no JAX.
+"""What the contact model and the solver's accuracy do to the robot. Plain MuJoCo.
 
 A policy, with every tenth action random as in training, stands on the boards of suite
 `corner` under other solver settings. Prints falls, tilt, and how far feet creep.
@@ -14,34 +14,23 @@ import mujoco
 import numpy as np
 
 from mjx_balance import evaluation, load_policy
+from mjx_balance.physics import LINE_SEARCH_ITERATIONS, PYRAMIDAL_IMPRATIO
 from mjx_balance.plant import View
 from mjx_balance.policy import Policy
 from mjx_balance.scene import Scene
 from mjx_balance.suites import make_scenarios
 
-LINE_SEARCH_ITERATIONS = 6  # as in training
+PYRAMIDAL = {"cone": float(mujoco.mjtCone.mjCONE_PYRAMIDAL), "impratio": PYRAMIDAL_IMPRATIO}
 VARIANTS: dict[str, dict[str, float]] = {
-    "as shipped": {},
-    "pyramidal cones": {"cone": mujoco.mjtCone.mjCONE_PYRAMIDAL},
-    "pyramidal cones, 4 Newton iterations (training)": {
-        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-        "iterations": 4,
-    },
-    "pyramidal cones, 2 Newton iterations": {
-        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-        "iterations": 2,
-    },
-    "pyramidal cones, 1 Newton iteration": {
-        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-        "iterations": 1,
-    },
+    "as shipped: elliptic cones": {},
     "elliptic cones, 4 Newton iterations": {"iterations": 4},
-    "impratio 1, contact time 20 ms": {"impratio": 1.0, "contact_time": 0.02},
-    "foot friction 0.4": {"friction": 0.4},
-    "foot friction 0.4, pyramidal cones": {
-        "friction": 0.4,
-        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-    },
+    "pyramidal cones, impratio 2": PYRAMIDAL,
+    "the same, 4 Newton iterations (training)": PYRAMIDAL | {"iterations": 4},
+    "the same, 2 Newton iterations": PYRAMIDAL | {"iterations": 2},
+    "the same, 1 Newton iteration": PYRAMIDAL | {"iterations": 1},
+    "elliptic cones, contact time 20 ms": {"contact_time": 0.02},
+    "elliptic cones, foot friction 0.4": {"friction": 0.4},
+    "pyramidal cones, impratio 2, foot friction 0.4": PYRAMIDAL | {"friction": 0.4},
 }
 
 
