@@ -29,7 +29,7 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (("--preset", "huge"), "unknown preset 'huge'; known presets: paper, default, smoke"),
+        (("--preset", "huge"), "unknown preset 'huge'; known presets: paper, default, best"),
         (("--warp-speed", "9"), "--warp-speed"),
         (("--gamma", "much"), "--gamma"),
         (("--gamma", "1.5"), "gamma is 1.5"),

@@ -82,7 +82,7 @@ def test_feet_move_straight_up_and_down_under_their_hips(config: Config, scene: 
 def test_ramp_is_a_line_then_rest(xp: types.ModuleType) -> None:
     """0.4 of 50 physics steps: half way after 10, there after 20, exactly."""
     before, after = xp.asarray([0.30, 0.31, 0.32, 0.33]), xp.asarray([0.32, 0.31, 0.30, 0.36])
-    got = np.asarray(ramp(TaskConfig(), before, after))
+    got = np.asarray(ramp(dataclasses.replace(TaskConfig(), action_ramp=0.4), before, after))
     assert got.shape == (50, 4)
     np.testing.assert_allclose(got[0], [0.301, 0.31, 0.319, 0.3315], atol=1e-6)
     np.testing.assert_allclose(got[9], [0.31, 0.31, 0.31, 0.345], atol=1e-6)

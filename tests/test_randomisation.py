@@ -86,7 +86,7 @@ def test_mjx_moves_as_plain_mujoco_in_the_same_circumstances(config: Config, epi
         DECISIONS * config.task.ctrl_dt,
     )
     other = nominal.tilt.reshape(ENVS, DECISIONS, -1).mean(axis=-1).T
-    assert np.median(np.abs(other - tilt)) > 0.05, "the circumstances matter"
+    assert np.median(np.abs(other - tilt)) > 0.03, "the circumstances matter"
 
 
 def test_noise_reaches_the_observation(episode) -> None:
