@@ -71,6 +71,7 @@ def main() -> None:
     text = "\n".join(
         [
             BEGIN,
+            "",
             "| variant | flag | `paper`: falls | mean | p95 | max "
             "| `corner`: falls | mean | p95 | max |",
             "|---" * 10 + "|",
@@ -78,6 +79,7 @@ def main() -> None:
             "",
             f"{args.decisions:,} decisions instead of {preset('default').num_env_steps:,}, seed "
             f"{args.seed}, {args.scenarios} held-out scenarios of 60 s per suite, tilt in deg.",
+            "",
             END,
         ]
     )

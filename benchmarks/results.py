@@ -147,6 +147,7 @@ def main() -> None:
     text = "\n".join(
         [
             BEGIN,
+            "",
             *suite_table(networks, baselines),
             "",
             f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval); "
@@ -155,6 +156,7 @@ def main() -> None:
             "by their mean tilt; seeds that training never sees. Fall-free share of the feasible "
             f"envelope: {min(shares):.2f} (worst seed). Commanded action while the board rests: "
             f"at most {settled:.3f} mm.",
+            "",
             END,
         ]
     )
