@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from markers import publish, table
 from rich.console import Console
 
 from mjx_balance import load_policy
@@ -35,7 +36,6 @@ SEED = 7_000_000
 DURATION = 60.0
 MAIN = ("paper", "corner")
 ENVELOPE_SCENARIOS, ENVELOPE_DURATION = 2, 30.0
-BEGIN, END = "<!-- results: written by benchmarks/results.py -->", "<!-- end of results -->"
 
 
 def measured(
@@ -76,12 +76,7 @@ def suite_table(
 ) -> list[str]:
     """One row per suite: the networks over their seeds, the baselines' mean tilt and falls."""
     names = [name for name in CONTROLLERS if name != "none"]
-    lines = [
-        "| suite | falls | mean tilt deg | p95 | max | worst seed | "
-        + " | ".join(f"`{name}`" for name in names)
-        + " |",
-        "|---" * (6 + len(names)) + "|",
-    ]
+    rows = []
     for suite, results in networks.items():
         row = over_seeds(results)
         cells = [f"`{suite}`", f"{row['falls']} of {row['scenarios']:,}"]
@@ -91,8 +86,9 @@ def suite_table(
             result = baselines[name][suite]
             fell = f" ({result['falls']} fall)" if result["falls"] else ""
             cells.append(f"{result['tilt_deg']['mean']:.3f}{fell}")
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
+        rows.append(cells)
+    columns = ["suite", "falls", "mean tilt deg", "p95", "max", "worst seed"]
+    return table(columns + [f"`{name}`" for name in names], rows)
 
 
 def main() -> None:
@@ -144,27 +140,15 @@ def main() -> None:
         key = f"envelope {policy.fingerprint} {ENVELOPE_SCENARIOS}"
         shares.append(Envelope(**measured(args.out, key, "envelope", measure)).fall_free_share)
     settled = max(r["action_mm_settled"] for suite in MAIN for r in networks[suite])
-    text = "\n".join(
-        [
-            BEGIN,
-            "",
-            *suite_table(networks, baselines),
-            "",
-            f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval); "
-            f"{args.scenarios:,} scenarios of {DURATION:g} s per seed in `paper` and `corner`, "
-            f"{args.others:,} in the others, {args.baselines:,} for the baselines, which are shown "
-            "by their mean tilt; seeds that training never sees. Fall-free share of the feasible "
-            f"envelope: {min(shares):.2f} (worst seed). Commanded action while the board rests: "
-            f"at most {settled:.3f} mm.",
-            "",
-            END,
-        ]
+    note = (
+        f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval); "
+        f"{args.scenarios:,} scenarios of {DURATION:g} s per seed in `paper` and `corner`, "
+        f"{args.others:,} in the others, {args.baselines:,} for the baselines, which are shown "
+        "by their mean tilt; seeds that training never sees. Fall-free share of the feasible "
+        f"envelope: {min(shares):.2f} (worst seed). Commanded action while the board rests: "
+        f"at most {settled:.3f} mm."
     )
-    print(text)
-    if args.write:
-        page = args.write.read_text()
-        head, rest = page.split(BEGIN)
-        args.write.write_text(head + text + rest.split(END)[1])
+    publish("results", [*suite_table(networks, baselines), "", note], args.write)
 
 
 if __name__ == "__main__":

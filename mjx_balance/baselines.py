@@ -148,10 +148,10 @@ class ImuPD(AttitudePD):
 
 
 class Predictive:
-    """Model predictive control on true attitude, response and a forecast of the board.
+    """Model predictive control on true attitude, response, latency and a forecast of the board.
 
     Minimises the squared tilt over every physics step of the next `HORIZON` decisions,
-    within the action limits, takes the first action and plans again.
+    within the action limits, takes the first action that is still open and plans again.
     """
 
     def __init__(self, scene: Scene, config: Config, forecast: Callable[..., np.ndarray]):
@@ -175,13 +175,15 @@ class Predictive:
         tail = np.ones_like(response.course)
         tail[:, :-steps] = response.course[:, steps:]
         self.unfinished = tail - response.course[:, steps - 1 : steps]
-        self.last = np.zeros((0, ACTION_AXES))
+        self.chosen = np.zeros((2, 0, ACTION_AXES))
 
     def __call__(self, view: View) -> np.ndarray:
         """Returns action indices (n,)."""
         task, n = self.config.task, len(view.ids)
         if view.decision == 0:
-            self.last = np.zeros((view.ids.max() + 1, ACTION_AXES))
+            self.chosen = np.zeros((2, view.ids.max() + 1, ACTION_AXES))
+        older, newer = self.chosen[:, view.ids]
+        late = view.late[:, None]
         ahead = task.sim_dt * np.arange(1, HORIZON * task.sim_steps + 1)
         now = np.full(n, view.decision * task.ctrl_dt)
         board = self.forecast(task, view.scenario, now, ahead)
@@ -195,18 +197,20 @@ class Predictive:
             axis=-1,
         )
         free = attitude(self.scene, view)[:, None] + board
-        free = free + self.last[view.ids][:, None] * self.unfinished.T
+        free = free + np.where(late, older, newer)[:, None] * self.unfinished.T
         linear = np.einsum("xjt,ntx->nxj", self.effect, free)
         limit = np.abs(self.gain) * task.action_max
         plan = np.zeros((n, ACTION_AXES, HORIZON))
+        plan[..., 0] = np.where(late, newer, 0)
         for _ in range(SWEEPS):
             for j in range(HORIZON):
                 slope = linear[..., j] + np.einsum("nxk,xk->nx", plan, self.gram[:, j])
                 moved = plan[..., j] - slope / self.gram[:, j, j]
-                plan[..., j] = np.clip(moved, -limit, limit)
-        action = nearest_action(task, plan[..., 0] / self.gain)
-        self.last[view.ids] = plan[..., 0]
-        return action
+                fixed = late & (j == 0)
+                plan[..., j] = np.where(fixed, plan[..., j], np.clip(moved, -limit, limit))
+        choice = np.where(late, plan[..., 1], plan[..., 0])
+        self.chosen[:, view.ids] = newer, choice
+        return nearest_action(task, choice / self.gain)
 
 
 def at_this_rate(task, scenario: tilt.Scenario, now: np.ndarray, ahead: np.ndarray) -> np.ndarray:

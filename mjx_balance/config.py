@@ -104,13 +104,18 @@ class TaskConfig:
     """Greatest height change of one decision on one axis, m (paper Eq. 3)."""
     action_levels: int = 21
     """Height changes per axis (paper Eq. 3: n = 0..20)."""
-    action_ramp: float = 0.2
+    action_ramp: float = 0.1
     """Share of a decision in which the legs reach their new heights (chosen: the gyro then
     reads the board's own rate before the next decision; benchmarks/README.md)."""
     gyro_lags: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     """Gyro samples in the observation, physics steps back (paper Eq. 2)."""
     accel_lags: tuple[int, ...] = (0, 2, 4, 6, 8, 10, 12, 14, 15)
     """Accelerometer samples in the observation, physics steps back (paper Eq. 2)."""
+    imu_mean: int = 1
+    """IMU samples whose mean is one input, back from its lag (paper Eq. 2: 1)."""
+    command_input: bool = False
+    """Whether the commanded foot heights enter the network too: beside the measured ones they
+    show late actions and legs that give way (paper Eq. 2: no)."""
     height_scale: float = 0.01
     """Foot height, less the standing height, that enters the network as 1, m (chosen)."""
     gyro_scale: float = math.radians(1.0)
@@ -146,7 +151,7 @@ class TaskConfig:
     @property
     def history(self) -> int:
         """IMU samples that the observation looks back on, the newest included."""
-        return max(*self.gyro_lags, *self.accel_lags) + 1
+        return max(*self.gyro_lags, *self.accel_lags) + self.imu_mean
 
     @property
     def num_actions(self) -> int:
@@ -280,16 +285,20 @@ _DQN = DQNConfig(
 PRESETS: Mapping[str, Config] = {
     "paper": Config(preset="paper"),
     "default": Config(preset="default", task=_TASK, dqn=_DQN),
-    # Every IMU sample since the last decision instead of the paper's lags, with the noise of a
-    # data sheet: what `default` reads off tiny differences, this one has to average.
+    # Every IMU sample since the last decision instead of the paper's lags, and the commanded
+    # heights, under noise of a data sheet, payloads and late actions: what `default` reads off
+    # tiny differences, this one has to average. The greater gamma is for the late actions.
     "best": Config(
         preset="best",
         num_env_steps=160_000,
         task=dataclasses.replace(
-            _TASK, gyro_lags=_SINCE_LAST_DECISION, accel_lags=_SINCE_LAST_DECISION
+            _TASK,
+            gyro_lags=_SINCE_LAST_DECISION,
+            accel_lags=_SINCE_LAST_DECISION,
+            command_input=True,
         ),
-        random=RandomConfig(gyro_noise=0.002, accel_noise=0.023),
-        dqn=_DQN,
+        random=RandomConfig(gyro_noise=0.002, accel_noise=0.023, payload=5.0, latency_share=0.15),
+        dqn=dataclasses.replace(_DQN, gamma=0.4, whiten_floor=0.02),
     ),
     "smoke": Config(
         preset="smoke",
@@ -423,7 +432,7 @@ _POSITIVE = frozenset(
     "sim_dt ctrl_dt body_height max_incline board_rate target_period action_max height_scale "
     "gyro_scale accel_scale reward_toward_scale episode_length learning_rate batch_size "
     "updates_per_step replay_capacity min_replay_size target_update_period epsilon_decay_steps "
-    "max_grad_norm whiten_floor num_envs num_seeds num_env_steps num_devices log_every "
+    "max_grad_norm whiten_floor imu_mean num_envs num_seeds num_env_steps num_devices log_every "
     "checkpoint_every eval_scenarios eval_duration friction_min friction_max foot_friction "
     "servo_stiffness hip_x hip_y thigh calf foot_radius".split()
 )

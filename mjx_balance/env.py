@@ -5,7 +5,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from brax.envs.base import Env, State
 
 from mjx_balance import physics
@@ -13,7 +12,7 @@ from mjx_balance.config import ACTION_AXES, Config, RandomConfig, check, preset
 from mjx_balance.plant import decision_ctrl, observation, standing_heights
 from mjx_balance.scene import Scene, load_scene, model_fields
 from mjx_balance.task import tilt
-from mjx_balance.task.actions import action_table, apply_action, nearest_action
+from mjx_balance.task.actions import action_table, apply_action
 from mjx_balance.task.conditions import DRAWS, draw_conditions
 from mjx_balance.task.observation import extend_history, observation_names
 from mjx_balance.task.reward import failed, reward_terms
@@ -85,9 +84,11 @@ class BalanceEnv(Env):
         rng, key_conditions, key_noise = jax.random.split(rng, 3)
         state = physics.initial_state(self.scene)
         still = jnp.asarray(self.scene.stance.imu, jnp.float32)
+        stand = jnp.asarray(standing_heights(self.config), jnp.float32)
         info = {
             "scenario": self._scenario(rng),
-            "heights": jnp.asarray(standing_heights(self.config), jnp.float32),
+            "heights": stand,
+            "commanded": stand,
             "imu": jnp.tile(still, (task.history, 1)),
             "tilt": jnp.float32(0.0),
             "decision": jnp.int32(0),
@@ -97,14 +98,13 @@ class BalanceEnv(Env):
             uniform = jax.random.uniform(key_conditions, (DRAWS,))
             info |= {
                 "conditions": draw_conditions(self.config.random, self.config.robot, uniform),
-                "pending": jnp.int32(nearest_action(task, np.zeros(ACTION_AXES))),
                 "noise_key": key_noise,
             }
         metrics = {
             name: jnp.float32(0.0)
             for name in ("tilt_deg", "fall", "reward_level", "reward_toward", "reward_fail")
         }
-        obs = observation(self.config, self.scene, state.qpos, info["imu"])
+        obs = observation(self.config, self.scene, state.qpos, stand, info["imu"])
         zero = jnp.float32(0.0)
         return State(state, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
 
@@ -121,13 +121,12 @@ class BalanceEnv(Env):
         config, task = self.config, self.config.task
         info: dict[str, Any] = state.info
         fields: dict[str, jax.Array] = {}
+        change = jnp.asarray(self._table)[action]
+        heights = commanded = apply_action(task, config.robot, info["commanded"], change)
         if self._randomised:
             late = info["conditions"].latency > 0
-            chosen, action = action, jnp.where(late, info["pending"], action)  # pyright: ignore
-            info = info | {"pending": chosen.astype(jnp.int32)}
+            heights = jnp.where(late, info["commanded"], commanded)
             fields = model_fields(self.scene, info["conditions"])
-        change = jnp.asarray(self._table)[action]
-        heights = apply_action(task, config.robot, info["heights"], change)
         decision = info["decision"]
         ctrl = decision_ctrl(
             config, self.scene, info["scenario"], decision, info["heights"], heights
@@ -154,6 +153,7 @@ class BalanceEnv(Env):
         }
         info = info | {
             "heights": heights,
+            "commanded": commanded,
             "imu": imu,
             "tilt": after,
             "decision": decision + 1,
@@ -161,7 +161,7 @@ class BalanceEnv(Env):
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=moved,
-            obs=observation(config, self.scene, moved.qpos, imu),
+            obs=observation(config, self.scene, moved.qpos, commanded, imu),
             reward=sum(terms.values()),
             done=(fell | truncated).astype(jnp.float32),
             metrics=state.metrics | metrics,

@@ -20,7 +20,7 @@ from mjx_balance.policy import Policy, PolicyError
 from mjx_balance.scene import Scene, load_scene, model_fields
 from mjx_balance.suites import authority, find_suite, make_scenarios
 from mjx_balance.task import tilt
-from mjx_balance.task.actions import action_table, apply_action, nearest_action
+from mjx_balance.task.actions import action_table, apply_action
 from mjx_balance.task.conditions import Conditions
 from mjx_balance.task.observation import extend_history
 from mjx_balance.task.reward import body_tilt, failed
@@ -97,7 +97,6 @@ def roll_out(
     decisions = int(np.ceil(duration / task.ctrl_dt - 1e-9))
     steps = decisions * task.sim_steps
     table = action_table(task)
-    stand = int(nearest_action(task, np.zeros(2)))
     batch = Batch(scene.model, count, threads or os.cpu_count() or 1)
     rng = np.random.default_rng(noise_seed)
     sigma = None
@@ -112,7 +111,7 @@ def roll_out(
     batch.qvel = scene.stance.qvel
     batch.qacc_warmstart = scene.stance.qacc_warmstart
     heights = np.tile(standing_heights(config), (count, 1))
-    pending = np.full(count, stand)
+    commanded = heights.copy()
     imu = np.tile(scene.stance.imu, (count, max(task.history, task.sim_steps), 1))
     tilts = np.full((count, steps), task.fail_tilt)
     actions = np.full((count, decisions), np.nan)
@@ -123,14 +122,14 @@ def roll_out(
     for k in range(decisions):
         some = tilt.Scenario(*(x[alive] for x in scenarios))
         qpos = batch.qpos[alive]
-        obs = observation(config, scene, qpos, imu[alive, -task.history :])
+        obs = observation(config, scene, qpos, commanded[alive], imu[alive, -task.history :])
         recent = imu[alive, -task.sim_steps :]
-        chosen = controller(View(alive, k, obs, recent, qpos, batch.qvel[alive], some))
-        taken = np.where(latency[alive], pending[alive], chosen)
-        pending[alive] = chosen
-        change = table[taken]
-        before = heights[alive]
-        heights[alive] = apply_action(task, robot, before, change)
+        chosen = controller(
+            View(alive, k, obs, recent, qpos, batch.qvel[alive], some, latency[alive])
+        )
+        before, late = heights[alive], commanded[alive]
+        commanded[alive] = apply_action(task, robot, late, table[chosen])
+        heights[alive] = np.where(latency[alive, None], late, commanded[alive])
         now = np.full(len(alive), float(k))
         ctrl = decision_ctrl(config, scene, some, now, before, heights[alive])
         out = batch.rollout(task.sim_steps, ctrl, record=("qpos", "sensordata"), ids=alive)

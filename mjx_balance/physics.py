@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from mujoco import mjx
 
 from mjx_balance.scene import Scene
@@ -21,8 +20,6 @@ SOLVER_ITERATIONS = 4
 """Newton iterations in training. A batch waits for its slowest world, but fewer do not
 converge when a random policy lifts a foot: with one, robots jump (benchmarks/README.md)."""
 LINE_SEARCH_ITERATIONS = 6
-PYRAMIDAL_IMPRATIO = 2.0
-"""With it, feet on a slope creep with pyramidal cones as they do with the scene's elliptic ones."""
 
 
 class PhysicsState(NamedTuple):
@@ -62,10 +59,6 @@ def initial_state(scene: Scene) -> PhysicsState:
 def mjx_advance(scene: Scene) -> Advance:
     """Puts the scene's model on the device and returns its `Advance` for one world."""
     training_model = copy.copy(scene.model)
-    # Elliptic cones cost MJX more and wanted more iterations where they were tried, with
-    # impratio 10; whether they do with impratio 1 is open.
-    training_model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    training_model.opt.impratio = PYRAMIDAL_IMPRATIO
     training_model.opt.iterations = SOLVER_ITERATIONS
     training_model.opt.ls_iterations = LINE_SEARCH_ITERATIONS
     with jax.ensure_compile_time_eval():  # constants, even where this runs inside a trace

@@ -34,6 +34,8 @@ class View(NamedTuple):
     """(n, nv) true velocities."""
     scenario: tilt.Scenario
     """Where the boards go."""
+    late: np.ndarray
+    """(n,) whether actions are taken one decision late."""
 
 
 def decision_ctrl(
@@ -68,20 +70,21 @@ def decision_ctrl(
     return flat[..., order]
 
 
-def observation(config: Config, scene: Scene, qpos: Array, imu: Array) -> Array:
+def observation(config: Config, scene: Scene, qpos: Array, commanded: Array, imu: Array) -> Array:
     """The network's input.
 
     Args:
       config: observation layout.
       scene: joint addresses.
       qpos: (..., nq)
+      commanded: (..., legs) foot heights that the latest action asked for, m.
       imu: (..., task.history, 6) latest IMU samples, the newest last.
 
     Returns:
       (..., obs_size)
     """
     heights = legs.foot_heights(config.robot, qpos[..., scene.leg_qpos])
-    return observe(config.task, config.robot, heights, imu)
+    return observe(config.task, config.robot, heights, commanded, imu)
 
 
 def standing_heights(config: Config) -> np.ndarray:

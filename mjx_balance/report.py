@@ -271,7 +271,7 @@ def _summary(runs: list[Run], policy: Policy, data: dict[str, Any]) -> list[str]
     ]
     shown = "".join(f"<div><b>{value}</b><span>{what}</span></div>" for value, what in tiles)
     described = {
-        "policy": f"this network: {policy.observation_size} raw inputs",
+        "policy": f"this network: {policy.observation_size} inputs",
         "none": "stands still",
         "pd-imu": "PD on a complementary filter of the same IMU",
         "pd-attitude": "PD on the true attitude",

@@ -66,6 +66,17 @@ def test_knowing_more_means_tilting_less(config: Config, scene: Scene) -> None:
     assert mean["rate-oracle"] < 0.1
 
 
+def test_the_oracles_know_of_latency(config: Config, scene: Scene) -> None:
+    """A controller that does not takes back the same tilt twice."""
+
+    def mean(name: str) -> float:
+        controller = make_controller(name, scene, config)
+        return float(run_suite(scene, config, controller, "latency", 4, 20.0, 5).tilt.mean())
+
+    means = {name: mean(name) for name in ("pd-attitude", "rate-oracle", "clairvoyant")}
+    assert means["clairvoyant"] < means["rate-oracle"] < 0.3 < 0.6 < means["pd-attitude"]
+
+
 def test_filters_keep_every_worlds_own_memory(config: Config, scene: Scene) -> None:
     """A world's tilt does not depend on which others run, or fall, beside it."""
     controller = make_controller("pd-imu", scene, config)

@@ -70,6 +70,7 @@ def test_reach_of_the_legs_at_the_knee_limits() -> None:
         ("task", {"fail_tilt": 90.0}, ("fail_tilt is 90.0",)),
         ("task", {"action_levels": 20}, ("action_levels is 20", "odd")),
         ("task", {"action_levels": 1}, ("action_levels is 1",)),
+        ("task", {"imu_mean": 0}, ("imu_mean is 0",)),
         ("task", {"action_ramp": 0.0}, ("action_ramp is 0.0",)),
         ("task", {"action_ramp": 1.1}, ("action_ramp is 1.1",)),
         ("task", {"gyro_lags": (0, -1)}, ("gyro_lags is (0, -1)",)),

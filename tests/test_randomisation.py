@@ -10,6 +10,7 @@ import pytest
 from mjx_balance.config import Config, RandomConfig, preset
 from mjx_balance.env import BalanceEnv
 from mjx_balance.evaluation import roll_out
+from mjx_balance.task.actions import action_table, apply_action
 from mjx_balance.task.conditions import Conditions
 from mjx_balance.task.tilt import Scenario
 
@@ -29,7 +30,9 @@ RANDOM = RandomConfig(
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    return dataclasses.replace(preset("default"), random=RANDOM)
+    default = preset("default")
+    task = dataclasses.replace(default.task, command_input=True)
+    return dataclasses.replace(default, random=RANDOM, task=task)
 
 
 @pytest.fixture(scope="module")
@@ -96,4 +99,20 @@ def test_noise_reaches_the_observation(episode) -> None:
     jitter = np.diff(imu[:, -8:, 2], n=2, axis=1) / np.sqrt(6)
     assert jitter.std() == pytest.approx(0.002, rel=0.25)
     newest = imu[:, -1, 3] / env.config.task.accel_scale
-    np.testing.assert_allclose(end.obs[:, 16], newest, rtol=1e-5)
+    np.testing.assert_allclose(end.obs[:, 20], newest, rtol=1e-5)
+
+
+def test_a_late_robot_is_told_its_command_at_once_and_obeys_one_decision_later(episode) -> None:
+    env, start, actions, end, _ = episode
+    task = env.config.task
+    change = action_table(task)[actions]
+    heights = late = np.asarray(start.info["heights"])
+    for k in range(DECISIONS):
+        late, heights = heights, apply_action(task, env.config.robot, heights, change[k])
+    np.testing.assert_allclose(end.info["commanded"], heights, atol=1e-6)
+    is_late = start.info["conditions"].latency[:, None] > 0
+    np.testing.assert_allclose(end.info["heights"], np.where(is_late, late, heights), atol=1e-6)
+    told = (heights - task.body_height) / task.height_scale
+    np.testing.assert_allclose(end.obs[:, 4:8], told, atol=1e-4)
+    measured = task.body_height + end.obs[:, :4] * task.height_scale
+    assert np.abs(measured - end.info["heights"]).max() < 0.002

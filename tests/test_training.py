@@ -75,11 +75,8 @@ def test_metrics_are_logged_and_the_loss_falls(run: Path) -> None:
     assert lines[-1]["train/epsilon"] < lines[0]["train/epsilon"]
 
 
-def test_an_interrupted_and_resumed_run_equals_an_uninterrupted_one(
-    run: Path, cache: dict[str, str], tmp_path: Path
-) -> None:
-    folder = tmp_path / "run"
-    process = start(cache, *FLAGS, "--run-dir", str(folder))
+def interrupt_after_first_metrics(process: subprocess.Popen[str], folder: Path) -> None:
+    """Presses Ctrl-C as soon as the run has logged something."""
     metrics = folder / "metrics.jsonl"
     while not (metrics.is_file() and metrics.read_text()) and process.poll() is None:
         time.sleep(0.05)
@@ -87,6 +84,14 @@ def test_an_interrupted_and_resumed_run_equals_an_uninterrupted_one(
     out, err = process.communicate()
     assert process.returncode == 130, out + err
     assert "--resume" in out
+
+
+def test_an_interrupted_and_resumed_run_equals_an_uninterrupted_one(
+    run: Path, cache: dict[str, str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    metrics = folder / "metrics.jsonl"
+    interrupt_after_first_metrics(start(cache, *FLAGS, "--run-dir", str(folder)), folder)
     assert load_policy(folder / "policy.safetensors").manifest["training"]["env_steps"] < 6144
 
     process = start(cache, "--resume", str(folder))
@@ -99,14 +104,24 @@ def test_an_interrupted_and_resumed_run_equals_an_uninterrupted_one(
     assert steps == list(range(1024, 6145, 1024))
 
 
-def test_several_seeds_leave_a_policy_each_and_the_best_one(
-    cache: dict[str, str], tmp_path: Path
-) -> None:
-    folder = tmp_path / "run"
-    flags = "--preset smoke --num-env-steps 2048 --eval-scenarios 4 --eval-duration 5".split()
-    process = start(cache, *flags, "--num-seeds", "2", "--seed", "3", "--run-dir", str(folder))
+SEVERAL = (
+    "--preset smoke --num-env-steps 4096 --eval-scenarios 4 --eval-duration 5 "
+    "--num-seeds 2 --seed 3"
+).split()
+
+
+@pytest.fixture(scope="module")
+def several(cache: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of two seeds."""
+    folder = tmp_path_factory.mktemp("several") / "run"
+    process = start(cache, *SEVERAL, "--run-dir", str(folder))
     out, err = process.communicate()
     assert process.returncode == 0, out + err
+    return folder
+
+
+def test_several_seeds_leave_a_policy_each_and_the_best_one(several: Path) -> None:
+    folder = several
     seeds = json.loads((folder / "seeds.json").read_text())
     assert [row["seed"] for row in seeds["seeds"]] == [3, 4]
     names = {f"seed-{row['seed']}.safetensors" for row in seeds["seeds"]}
@@ -131,6 +146,19 @@ def test_several_seeds_leave_a_policy_each_and_the_best_one(
     line = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
     assert len(line["seeds"]["tilt_deg"]) == 2
     assert line["train/tilt_deg"] == pytest.approx(np.mean(line["seeds"]["tilt_deg"]))
+
+
+def test_several_seeds_can_be_interrupted_and_resumed(
+    several: Path, cache: dict[str, str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    interrupt_after_first_metrics(start(cache, *SEVERAL, "--run-dir", str(folder)), folder)
+    process = start(cache, "--resume", str(folder))
+    out, err = process.communicate()
+    assert process.returncode == 0, out + err
+    for name in ("seed-3.safetensors", "seed-4.safetensors"):
+        whole, resumed = (load_policy(p / "seeds" / name) for p in (several, folder))
+        assert whole.fingerprint == resumed.fingerprint
 
 
 def test_a_second_start_compiles_nothing(run: Path, cache: dict[str, str], tmp_path: Path) -> None:

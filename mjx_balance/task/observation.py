@@ -1,4 +1,7 @@
-"""The observation of paper Eq. 2: four foot heights and lagged raw IMU samples."""
+"""The observation of paper Eq. 2: four foot heights and lagged raw IMU samples.
+
+On request the commanded foot heights follow the measured ones.
+"""
 
 import numpy as np
 
@@ -9,9 +12,14 @@ IMU_CHANNELS = 6
 """Gyro x, y, z in rad/s, then accelerometer x, y, z in m/s^2."""
 
 
+def _height_symbols(task: TaskConfig) -> tuple[str, ...]:
+    """H: measured foot heights, C: commanded ones."""
+    return ("H", "C") if task.command_input else ("H",)
+
+
 def observation_names(task: TaskConfig, robot: RobotConfig) -> tuple[str, ...]:
     """Name of every observation entry, in order, e.g. `H_LF`, `V_x,t-2`, `Acc_y,t-15`."""
-    names = [f"H_{leg}" for leg in robot.legs]
+    names = [f"{symbol}_{leg}" for symbol in _height_symbols(task) for leg in robot.legs]
     for symbol, lags in (("V", task.gyro_lags), ("Acc", task.accel_lags)):
         names += [f"{symbol}_{axis},t-{lag}" for axis in "xy" for lag in lags]
     return tuple(names)
@@ -20,20 +28,23 @@ def observation_names(task: TaskConfig, robot: RobotConfig) -> tuple[str, ...]:
 def observation_scale(task: TaskConfig, robot: RobotConfig) -> np.ndarray:
     """(obs_size,) physical size of a network input of 1: m, rad/s and m/s^2."""
     return np.asarray(
-        [task.height_scale] * len(robot.legs)
+        [task.height_scale] * len(_height_symbols(task)) * len(robot.legs)
         + [task.gyro_scale] * 2 * len(task.gyro_lags)
         + [task.accel_scale] * 2 * len(task.accel_lags),
         np.float32,
     )
 
 
-def observe(task: TaskConfig, robot: RobotConfig, heights: Array, imu: Array) -> Array:
+def observe(
+    task: TaskConfig, robot: RobotConfig, heights: Array, commanded: Array, imu: Array
+) -> Array:
     """Builds the scaled observation.
 
     Args:
       task: lags and scales.
       robot: leg order.
       heights: (..., legs) measured foot heights, m.
+      commanded: (..., legs) commanded foot heights, m; seen with `task.command_input` alone.
       imu: (..., task.history, 6) latest IMU samples, the newest last.
 
     Returns:
@@ -41,10 +52,12 @@ def observe(task: TaskConfig, robot: RobotConfig, heights: Array, imu: Array) ->
     """
     xp = imu.__array_namespace__()
     newest = imu.shape[-2] - 1
-    gyro = imu[..., newest - np.asarray(task.gyro_lags), :]
-    accel = imu[..., newest - np.asarray(task.accel_lags), :]
+    block = np.arange(task.imu_mean)[:, None]
+    gyro = imu[..., newest - block - np.asarray(task.gyro_lags), :].mean(axis=-3)
+    accel = imu[..., newest - block - np.asarray(task.accel_lags), :].mean(axis=-3)
     parts = (
         heights - task.body_height,
+        *([commanded - task.body_height] if task.command_input else []),
         gyro[..., 0],
         gyro[..., 1],
         accel[..., 3],

@@ -28,7 +28,9 @@ def symmetries(task: TaskConfig, robot: RobotConfig) -> Symmetries:
     """
     legs = list(robot.legs)
     gyro, accel = len(task.gyro_lags), len(task.accel_lags)
-    rest = np.arange(len(legs), len(legs) + 2 * (gyro + accel))
+    rows = 1 + task.command_input  # measured heights, commanded ones
+    heights = rows * len(legs)
+    rest = np.arange(heights, heights + 2 * (gyro + accel))
     level = np.arange(task.action_levels)
     index, sign, action = [], [], []
     for left_right in (False, True):
@@ -37,9 +39,10 @@ def symmetries(task: TaskConfig, robot: RobotConfig) -> Symmetries:
                 ("LR" if left_right else "") + ("FH" if front_hind else ""),
                 ("RL" if left_right else "") + ("HF" if front_hind else ""),
             )
-            index.append([*(legs.index(leg.translate(swap)) for leg in legs), *rest])
+            swapped = np.asarray([legs.index(leg.translate(swap)) for leg in legs])
+            index.append([*(swapped + len(legs) * np.arange(rows)[:, None]).ravel(), *rest])
             roll, pitch = 1 - 2 * left_right, 1 - 2 * front_hind
-            sign.append([1] * len(legs) + [roll] * gyro + [pitch] * (gyro + accel) + [roll] * accel)
+            sign.append([1] * heights + [roll] * gyro + [pitch] * (gyro + accel) + [roll] * accel)
             a_x = level[::-1] if left_right else level
             a_y = level[::-1] if front_hind else level
             action.append((a_x[:, None] * task.action_levels + a_y).ravel())
