@@ -17,7 +17,7 @@ from markers import publish, table
 
 from mjx_balance.config import preset
 
-FIFTHS = " ".join(str(lag) for lag in range(0, 50, 5))
+LAGS = " ".join(str(lag) for lag in range(0, 50, 5))
 VARIANTS = {
     "preset `default`": "",
     "no whitening": "--whiten-steps 0",
@@ -30,7 +30,7 @@ VARIANTS = {
     "learning rate 1e-3": "--learning-rate 1e-3",
     "Double DQN": "--double",
     "gamma 0.4": "--gamma 0.4",
-    "means over 20 ms of all IMU samples": f"--imu-mean 5 --gyro-lags {FIFTHS} --accel-lags {FIFTHS}",
+    "means over 20 ms of all IMU samples": f"--imu-mean 5 --gyro-lags {LAGS} --accel-lags {LAGS}",
     "commanded foot heights as inputs": "--command-input",
     "legs move for 40% of the decision": "--action-ramp 0.4",
     "targets from the paper's disc alone": "--square-share 0",
