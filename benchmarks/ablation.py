@@ -31,7 +31,7 @@ VARIANTS = {
     "Double DQN": "--double",
     "gamma 0.4": "--gamma 0.4",
     "means over 20 ms of all IMU samples": f"--imu-mean 5 --gyro-lags {LAGS} --accel-lags {LAGS}",
-    "commanded foot heights as inputs": "--command-input",
+    "commanded foot heights as inputs": "--command-lags 0",
     "legs move for 40% of the decision": "--action-ramp 0.4",
     "targets from the paper's disc alone": "--square-share 0",
 }

@@ -27,12 +27,12 @@ from mjx_balance.scene import load_scene
 TRAINING_SEED, HELD_OUT_SEED = 5_000_000, 7_000_000
 GRIDS: Mapping[type, Mapping[str, Sequence[float]]] = {
     AttitudePD: {
-        "proportional": (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3),
+        "proportional": (0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6),
         "rate": (0.08, 0.1, 0.12, 0.14, 0.16, 0.18, 0.2),
     },
     ImuPD: {
         "tau": (0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0),
-        "proportional": (0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2),
+        "proportional": (0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4),
         "rate": (0.0, 0.04, 0.08, 0.12, 0.14, 0.16, 0.18, 0.2, 0.22),
         "samples": (1, 3, 6, 12, 20),
     },

@@ -113,9 +113,9 @@ class TaskConfig:
     """Accelerometer samples in the observation, physics steps back (paper Eq. 2)."""
     imu_mean: int = 1
     """IMU samples whose mean is one input, back from its lag (paper Eq. 2: 1)."""
-    command_input: bool = False
-    """Whether the commanded foot heights enter the network too: beside the measured ones they
-    show late actions and legs that give way (paper Eq. 2: no)."""
+    command_lags: tuple[int, ...] = ()
+    """Decisions back whose commanded foot heights enter the network too: beside the measured
+    ones they show late actions and legs that give way (paper Eq. 2: none)."""
     height_scale: float = 0.01
     """Foot height, less the standing height, that enters the network as 1, m (chosen)."""
     gyro_scale: float = math.radians(1.0)
@@ -152,6 +152,11 @@ class TaskConfig:
     def history(self) -> int:
         """IMU samples that the observation looks back on, the newest included."""
         return max(*self.gyro_lags, *self.accel_lags) + self.imu_mean
+
+    @property
+    def command_history(self) -> int:
+        """Commands that the observation looks back on, at least the newest."""
+        return max(self.command_lags, default=0) + 1
 
     @property
     def num_actions(self) -> int:
@@ -295,7 +300,7 @@ PRESETS: Mapping[str, Config] = {
             _TASK,
             gyro_lags=_SINCE_LAST_DECISION,
             accel_lags=_SINCE_LAST_DECISION,
-            command_input=True,
+            command_lags=(0,),
         ),
         random=RandomConfig(gyro_noise=0.002, accel_noise=0.023, payload=5.0, latency_share=0.15),
         dqn=dataclasses.replace(_DQN, gamma=0.4, whiten_floor=0.02),
@@ -380,6 +385,8 @@ def check(config: Config) -> Config:
         lags = getattr(task, name)
         if not lags or min(lags) < 0:
             raise ConfigError(f"{name} is {lags}; it must hold at least one lag, none negative")
+    if min(task.command_lags, default=0) < 0:
+        raise ConfigError(f"command_lags is {task.command_lags}; none may be negative")
     steepest = task.max_incline if random.incline_max is None else random.incline_max
     ramp = 2 * steepest / task.board_rate
     if ramp > task.target_period:

@@ -85,10 +85,11 @@ class BalanceEnv(Env):
         state = physics.initial_state(self.scene)
         still = jnp.asarray(self.scene.stance.imu, jnp.float32)
         stand = jnp.asarray(standing_heights(self.config), jnp.float32)
+        commanded = jnp.tile(stand, (task.command_history, 1))
         info = {
             "scenario": self._scenario(rng),
             "heights": stand,
-            "commanded": stand,
+            "commanded": commanded,
             "imu": jnp.tile(still, (task.history, 1)),
             "tilt": jnp.float32(0.0),
             "decision": jnp.int32(0),
@@ -104,7 +105,7 @@ class BalanceEnv(Env):
             name: jnp.float32(0.0)
             for name in ("tilt_deg", "fall", "reward_level", "reward_toward", "reward_fail")
         }
-        obs = observation(self.config, self.scene, state.qpos, stand, info["imu"])
+        obs = observation(self.config, self.scene, state.qpos, commanded, info["imu"])
         zero = jnp.float32(0.0)
         return State(state, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
 
@@ -122,10 +123,11 @@ class BalanceEnv(Env):
         info: dict[str, Any] = state.info
         fields: dict[str, jax.Array] = {}
         change = jnp.asarray(self._table)[action]
-        heights = commanded = apply_action(task, config.robot, info["commanded"], change)
+        last = info["commanded"][-1]
+        heights = wanted = apply_action(task, config.robot, last, change)
         if self._randomised:
             late = info["conditions"].latency > 0
-            heights = jnp.where(late, info["commanded"], commanded)
+            heights = jnp.where(late, last, wanted)
             fields = model_fields(self.scene, info["conditions"])
         decision = info["decision"]
         ctrl = decision_ctrl(
@@ -146,6 +148,7 @@ class BalanceEnv(Env):
             samples = samples + info["conditions"].imu_noise * noise
             info = info | {"noise_key": key}
         imu = extend_history(info["imu"], samples)
+        commanded = extend_history(info["commanded"], wanted[None])
         metrics = {
             "tilt_deg": motion.tilt.mean(),
             "fall": fell.astype(jnp.float32),

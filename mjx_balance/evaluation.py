@@ -111,7 +111,7 @@ def roll_out(
     batch.qvel = scene.stance.qvel
     batch.qacc_warmstart = scene.stance.qacc_warmstart
     heights = np.tile(standing_heights(config), (count, 1))
-    commanded = heights.copy()
+    commanded = np.tile(heights[:, None], (1, task.command_history, 1))
     imu = np.tile(scene.stance.imu, (count, max(task.history, task.sim_steps), 1))
     tilts = np.full((count, steps), task.fail_tilt)
     actions = np.full((count, decisions), np.nan)
@@ -127,9 +127,10 @@ def roll_out(
         chosen = controller(
             View(alive, k, obs, recent, qpos, batch.qvel[alive], some, latency[alive])
         )
-        before, late = heights[alive], commanded[alive]
-        commanded[alive] = apply_action(task, robot, late, table[chosen])
-        heights[alive] = np.where(latency[alive, None], late, commanded[alive])
+        before, last = heights[alive], commanded[alive, -1]
+        wanted = apply_action(task, robot, last, table[chosen])
+        commanded[alive] = extend_history(commanded[alive], wanted[:, None])
+        heights[alive] = np.where(latency[alive, None], last, wanted)
         now = np.full(len(alive), float(k))
         ctrl = decision_ctrl(config, scene, some, now, before, heights[alive])
         out = batch.rollout(task.sim_steps, ctrl, record=("qpos", "sensordata"), ids=alive)

@@ -77,7 +77,8 @@ def observation(config: Config, scene: Scene, qpos: Array, commanded: Array, imu
       config: observation layout.
       scene: joint addresses.
       qpos: (..., nq)
-      commanded: (..., legs) foot heights that the latest action asked for, m.
+      commanded: (..., task.command_history, legs) foot heights that the latest actions asked
+        for, the newest last, m.
       imu: (..., task.history, 6) latest IMU samples, the newest last.
 
     Returns:

@@ -18,7 +18,7 @@ from mjx_balance.task.observation import (
 ROBOT = RobotConfig()
 UNSCALED = TaskConfig(height_scale=1.0, gyro_scale=1.0, accel_scale=1.0)
 HEIGHTS = np.asarray([0.351, 0.352, 0.353, 0.354])
-COMMANDED = np.asarray([0.345, 0.346, 0.347, 0.348])
+COMMANDED = np.asarray([[0.341, 0.342, 0.343, 0.344], [0.345, 0.346, 0.347, 0.348]])
 
 
 def readable_history(samples: int = 16) -> np.ndarray:
@@ -49,10 +49,10 @@ def test_names_say_what_the_entries_hold() -> None:
 
 def test_commanded_heights_follow_the_measured_ones_on_request() -> None:
     """0.345 m is 5 mm below the standing height: -0.5 of the scale of 1 cm."""
-    task = dataclasses.replace(TaskConfig(), command_input=True)
+    task = dataclasses.replace(TaskConfig(), command_lags=(0,))
     names = observation_names(task, ROBOT)
     got = observe(task, ROBOT, HEIGHTS, COMMANDED, readable_history())
-    assert names[4:8] == ("C_LF", "C_RF", "C_LH", "C_RH")
+    assert names[4:8] == ("C_LF,d-0", "C_RF,d-0", "C_LH,d-0", "C_RH,d-0")
     np.testing.assert_allclose(got[4:8], (-0.5, -0.4, -0.3, -0.2))
     without = observe(TaskConfig(), ROBOT, HEIGHTS, COMMANDED, readable_history())
     np.testing.assert_array_equal(np.delete(got, np.s_[4:8]), without)
@@ -105,8 +105,10 @@ def test_history_keeps_the_newest_samples_in_order(xp: types.ModuleType, count: 
 def test_batch_equals_a_loop(xp: types.ModuleType) -> None:
     rng = np.random.default_rng(0)
     heights, imu = xp.asarray(rng.normal(size=(3, 4))), xp.asarray(rng.normal(size=(3, 16, 6)))
-    loop = [observe(TaskConfig(), ROBOT, heights[k], heights[k], imu[k]) for k in range(3)]
-    np.testing.assert_allclose(observe(TaskConfig(), ROBOT, heights, heights, imu), np.stack(loop))
+    loop = [observe(TaskConfig(), ROBOT, heights[k], heights[:1], imu[k]) for k in range(3)]
+    np.testing.assert_allclose(
+        observe(TaskConfig(), ROBOT, heights, heights[:, None], imu), np.stack(loop)
+    )
 
 
 def test_numpy_and_jax_agree() -> None:

@@ -31,7 +31,7 @@ RANDOM = RandomConfig(
 @pytest.fixture(scope="module")
 def config() -> Config:
     default = preset("default")
-    task = dataclasses.replace(default.task, command_input=True)
+    task = dataclasses.replace(default.task, command_lags=(0,))
     return dataclasses.replace(default, random=RANDOM, task=task)
 
 
@@ -109,7 +109,7 @@ def test_a_late_robot_is_told_its_command_at_once_and_obeys_one_decision_later(e
     heights = late = np.asarray(start.info["heights"])
     for k in range(DECISIONS):
         late, heights = heights, apply_action(task, env.config.robot, heights, change[k])
-    np.testing.assert_allclose(end.info["commanded"], heights, atol=1e-6)
+    np.testing.assert_allclose(end.info["commanded"][:, -1], heights, atol=1e-6)
     is_late = start.info["conditions"].latency[:, None] > 0
     np.testing.assert_allclose(end.info["heights"], np.where(is_late, late, heights), atol=1e-6)
     told = (heights - task.body_height) / task.height_scale

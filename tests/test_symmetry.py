@@ -47,10 +47,12 @@ def test_reflections_by_hand(config: Config, group: Symmetries) -> None:
     assert len(turned) == 15
     mirrored = [names[i] for i in group.obs_index[FRONT_HIND]]
     assert mirrored[:4] == ["H_LH", "H_RH", "H_LF", "H_RF"]
-    more = dataclasses.replace(config.task, command_input=True)
+    more = dataclasses.replace(config.task, command_lags=(0,))
     group, names = symmetries(more, config.robot), observation_names(more, config.robot)
     mirrored = [names[i] for i in group.obs_index[LEFT_RIGHT]]
-    assert mirrored[:9] == "H_RF H_LF H_RH H_LH C_RF C_LF C_RH C_LH V_x,t-0".split()
+    assert mirrored[:9] == [
+        *("H_RF H_LF H_RH H_LH C_RF,d-0 C_LF,d-0 C_RH,d-0 C_LH,d-0 V_x,t-0".split())
+    ]
     assert (group.obs_sign[LEFT_RIGHT][:8] == 1).all()
     table = 1000 * action_table(config.task)
     np.testing.assert_allclose(table[group.action_index[LEFT_RIGHT]], table * (-1, 1), atol=1e-6)

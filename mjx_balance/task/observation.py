@@ -12,14 +12,13 @@ IMU_CHANNELS = 6
 """Gyro x, y, z in rad/s, then accelerometer x, y, z in m/s^2."""
 
 
-def _height_symbols(task: TaskConfig) -> tuple[str, ...]:
-    """H: measured foot heights, C: commanded ones."""
-    return ("H", "C") if task.command_input else ("H",)
-
-
 def observation_names(task: TaskConfig, robot: RobotConfig) -> tuple[str, ...]:
-    """Name of every observation entry, in order, e.g. `H_LF`, `V_x,t-2`, `Acc_y,t-15`."""
-    names = [f"{symbol}_{leg}" for symbol in _height_symbols(task) for leg in robot.legs]
+    """Name of every observation entry, in order, e.g. `H_LF`, `V_x,t-2`, `Acc_y,t-15`.
+
+    Commanded heights are `C_LF,d-1`: LF's of the decision before the latest.
+    """
+    names = [f"H_{leg}" for leg in robot.legs]
+    names += [f"C_{leg},d-{lag}" for lag in task.command_lags for leg in robot.legs]
     for symbol, lags in (("V", task.gyro_lags), ("Acc", task.accel_lags)):
         names += [f"{symbol}_{axis},t-{lag}" for axis in "xy" for lag in lags]
     return tuple(names)
@@ -28,7 +27,7 @@ def observation_names(task: TaskConfig, robot: RobotConfig) -> tuple[str, ...]:
 def observation_scale(task: TaskConfig, robot: RobotConfig) -> np.ndarray:
     """(obs_size,) physical size of a network input of 1: m, rad/s and m/s^2."""
     return np.asarray(
-        [task.height_scale] * len(_height_symbols(task)) * len(robot.legs)
+        [task.height_scale] * (1 + len(task.command_lags)) * len(robot.legs)
         + [task.gyro_scale] * 2 * len(task.gyro_lags)
         + [task.accel_scale] * 2 * len(task.accel_lags),
         np.float32,
@@ -44,7 +43,7 @@ def observe(
       task: lags and scales.
       robot: leg order.
       heights: (..., legs) measured foot heights, m.
-      commanded: (..., legs) commanded foot heights, m; seen with `task.command_input` alone.
+      commanded: (..., task.command_history, legs) commanded foot heights, the newest last, m.
       imu: (..., task.history, 6) latest IMU samples, the newest last.
 
     Returns:
@@ -55,9 +54,10 @@ def observe(
     block = np.arange(task.imu_mean)[:, None]
     gyro = imu[..., newest - block - np.asarray(task.gyro_lags), :].mean(axis=-3)
     accel = imu[..., newest - block - np.asarray(task.accel_lags), :].mean(axis=-3)
+    latest = commanded.shape[-2] - 1
     parts = (
         heights - task.body_height,
-        *([commanded - task.body_height] if task.command_input else []),
+        *(commanded[..., latest - lag, :] - task.body_height for lag in task.command_lags),
         gyro[..., 0],
         gyro[..., 1],
         accel[..., 3],
@@ -67,6 +67,6 @@ def observe(
 
 
 def extend_history(history: Array, samples: Array) -> Array:
-    """Appends (..., m, 6) samples to a (..., h, 6) history and keeps the last h."""
+    """Appends (..., m, k) samples to a (..., h, k) history and keeps the last h."""
     xp = history.__array_namespace__()
     return xp.concatenate((history, samples), axis=-2)[..., -history.shape[-2] :, :]

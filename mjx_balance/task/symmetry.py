@@ -28,7 +28,7 @@ def symmetries(task: TaskConfig, robot: RobotConfig) -> Symmetries:
     """
     legs = list(robot.legs)
     gyro, accel = len(task.gyro_lags), len(task.accel_lags)
-    rows = 1 + task.command_input  # measured heights, commanded ones
+    rows = 1 + len(task.command_lags)  # measured heights, commanded ones
     heights = rows * len(legs)
     rest = np.arange(heights, heights + 2 * (gyro + accel))
     level = np.arange(task.action_levels)
