@@ -1,8 +1,8 @@
-"""What each piece of preset `default` is worth: trains with it taken out or exchanged.
+"""What each piece of a preset is worth: trains with it taken out or exchanged.
 
-Every variant is a run of `train` with one flag changed, shorter than a full run, and
+Every variant is a run of `train` with a few flags changed, shorter than a full run, and
 keeps its folder, so that an interrupted ablation goes on where it stopped. `--write`
-puts the table between the markers of a Markdown file.
+puts the tables between the markers of a Markdown file.
 
     python benchmarks/ablation.py --write benchmarks/README.md
 """
@@ -11,52 +11,63 @@ import argparse
 import json
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 from markers import publish, table
 
 from mjx_balance.config import preset
 
-LAGS = " ".join(str(lag) for lag in range(0, 50, 5))
+
+def lags(samples: Iterable[int], commands: str = "") -> str:
+    """Flags for IMU samples and commands that the network sees."""
+    some = " ".join(str(lag) for lag in samples)
+    return f"--gyro-lags {some} --accel-lags {some} --command-lags {commands}".strip()
+
+
 VARIANTS = {
-    "preset `default`": "",
-    "no whitening": "--whiten-steps 0",
-    "no dither": "--dither 0",
-    "no mirror": "--no-mirror",
-    "head: factored, 21 + 21 outputs": "--head factored",
-    "head: joint, 441 outputs (paper)": "--head joint",
-    "reward for the tilt at the end": "--reward-tilt end",
-    "8 updates per decision of all boards": "--updates-per-step 8",
-    "learning rate 1e-3": "--learning-rate 1e-3",
-    "Double DQN": "--double",
-    "gamma 0.4": "--gamma 0.4",
-    "means over 20 ms of all IMU samples": f"--imu-mean 5 --gyro-lags {LAGS} --accel-lags {LAGS}",
-    "commanded foot heights as inputs": "--command-lags 0",
-    "legs move for 40% of the decision": "--action-ramp 0.4",
-    "targets from the paper's disc alone": "--square-share 0",
+    "default": {
+        "as it is": "",
+        "no whitening": "--whiten-steps 0",
+        "no dither": "--dither 0",
+        "no mirror": "--no-mirror",
+        "head: factored, 21 + 21 outputs": "--head factored",
+        "head: joint, 441 outputs (paper)": "--head joint",
+        "reward for the tilt at the end": "--reward-tilt end",
+        "8 updates per decision of all boards": "--updates-per-step 8",
+        "learning rate 1e-3": "--learning-rate 1e-3",
+        "Double DQN": "--double",
+        "gamma 0.4": "--gamma 0.4",
+        "legs move for 40% of the decision": "--action-ramp 0.4",
+        "targets from the paper's disc alone": "--square-share 0",
+    },
+    "best": {
+        "as it is": "",
+        "two decisions of samples and commands": lags(range(0, 100, 5), "0 1"),
+        "one decision": lags(range(0, 50, 5), "0"),
+        "one decision, means over 40 ms": f"--imu-mean 10 {lags(range(0, 50, 10), '0')}",
+        "one decision, every sample": f"--imu-mean 1 {lags(range(50), '0')}",
+        "the same, whiten_floor 0.001": f"--whiten-floor 1e-3 --imu-mean 1 {lags(range(50), '0')}",
+        "the same, whiten_floor 0.1": f"--whiten-floor 0.1 --imu-mean 1 {lags(range(50), '0')}",
+    },
 }
+"""Preset -> title -> flags."""
+DECISIONS = {"default": 30_000, "best": 100_000}
+SCENARIOS = {"default": 32, "best": 128}
 
 
-def main() -> None:
-    """Trains what is missing and prints the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--decisions", type=int, default=40_000)
-    parser.add_argument("--scenarios", type=int, default=64)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--runs", type=Path, default=Path("runs/ablation"))
-    parser.add_argument("--only", nargs="*", help="numbers of the variants to train; none: all")
-    parser.add_argument("--write", type=Path, help="Markdown file with markers")
-    args = parser.parse_args()
+def rows_of(name: str, args: argparse.Namespace) -> list[list[str]]:
+    """Trains what is missing of a preset's variants; returns the rows that there are."""
     rows = []
-    for number, (title, flags) in enumerate(VARIANTS.items()):
-        folder = args.runs / f"{number:02}-{args.decisions}-seed{args.seed}"
+    for number, (title, flags) in enumerate(VARIANTS[name].items()):
+        folder = args.runs / f"{name}-{number:02}-{DECISIONS[name]}-seed{args.seed}"
         result = folder / "evaluation.json"
-        wanted = args.only is None or str(number) in args.only
+        wanted = args.only is None or f"{name}-{number}" in args.only
         if wanted and not result.is_file():
             start = ["--resume", str(folder)] if folder.exists() else ["--run-dir", str(folder)]
             common = (
-                f"--num-env-steps {args.decisions} --eval-scenarios {args.scenarios} "
-                f"--seed {args.seed} --checkpoint-every {args.decisions}"
+                f"--preset {name} --num-env-steps {DECISIONS[name]} --seed {args.seed} "
+                f"--eval-scenarios {SCENARIOS[name]} --checkpoint-every {DECISIONS[name]}"
             )
             train = [sys.executable, "-m", "mjx_balance", "train", *start]
             # A resumed run takes its flags from its folder.
@@ -65,17 +76,35 @@ def main() -> None:
         if not result.is_file():
             continue
         suites = json.loads(result.read_text())
-        cells = [title, f"`{flags}`" if flags else ""]
+        cells = [title]
         for suite in ("paper", "corner"):
             tilt, falls = suites[suite]["tilt_deg"], suites[suite]["falls"]
-            cells += [str(falls), *(f"{tilt[name]:.3f}" for name in ("mean", "p95", "max"))]
+            cells += [str(falls), *(f"{tilt[key]:.3f}" for key in ("mean", "p95", "max"))]
         rows.append(cells)
-    columns = "variant|flag|`paper`: falls|mean|p95|max|`corner`: falls|mean|p95|max".split("|")
-    note = (
-        f"{args.decisions:,} decisions instead of {preset('default').num_env_steps:,}, seed "
-        f"{args.seed}, {args.scenarios} held-out scenarios of 60 s per suite, tilt in deg."
-    )
-    publish("ablation", [*table(columns, rows), "", note], args.write)
+    return rows
+
+
+def main() -> None:
+    """Trains what is missing and prints the tables."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--presets", nargs="+", default=list(VARIANTS), choices=VARIANTS)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--runs", type=Path, default=Path("runs/ablation"))
+    parser.add_argument("--only", nargs="*", help="variants to train, as default-3; none: all")
+    parser.add_argument("--write", type=Path, help="Markdown file with markers")
+    args = parser.parse_args()
+    lines = []
+    for name in args.presets:
+        columns = [f"preset `{name}`"]
+        for suite in ("paper", "corner"):
+            columns += [f"`{suite}`: falls", "mean", "p95", "max"]
+        lines += [*table(columns, rows_of(name, args)), ""]
+        lines += [
+            f"{DECISIONS[name]:,} decisions instead of {preset(name).num_env_steps:,}, seed "
+            f"{args.seed}, {SCENARIOS[name]} held-out scenarios of 60 s per suite, tilt in deg.",
+            "",
+        ]
+    publish("ablation", lines[:-1], args.write)
 
 
 if __name__ == "__main__":
