@@ -31,13 +31,16 @@ def test_policy_fits_in_the_repository_and_to_the_scene(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
-@pytest.mark.parametrize(("suite", "limit"), [("corner", 0.13), ("noise", 0.13)])
-def test_policy_balances(path: Path, suite: str, limit: float) -> None:
+@pytest.mark.parametrize(
+    ("suite", "mean", "most"),
+    [("corner", 0.13, 1.5), ("noise", 0.13, 1.5), ("payload", 0.13, 1.5), ("latency", 0.4, 4.0)],
+)
+def test_policy_balances(path: Path, suite: str, mean: float, most: float) -> None:
     """8 scenarios of 20 s; the figures of the README have more of both."""
     result = evaluate(load_policy(path), suite, 8, 20.0, 11)
     assert result["falls"] == 0
-    assert result["tilt_deg"]["mean"] < limit
-    assert result["tilt_deg"]["max"] < 1.5
+    assert result["tilt_deg"]["mean"] < mean
+    assert result["tilt_deg"]["max"] < most
     assert result["action_mm_settled"] < 0.3
 
 
