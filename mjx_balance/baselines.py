@@ -81,7 +81,7 @@ class Stand:
 class AttitudePD:
     """Proportional and derivative control on the true attitude and angular rate."""
 
-    def __init__(self, scene: Scene, config: Config, proportional: float = 1.1, rate: float = 0.14):
+    def __init__(self, scene: Scene, config: Config, proportional: float = 1.3, rate: float = 0.12):
         """Takes the gains.
 
         Args:
@@ -119,8 +119,8 @@ class ImuPD(AttitudePD):
         self,
         scene: Scene,
         config: Config,
-        proportional: float = 1.0,
-        rate: float = 0.16,
+        proportional: float = 1.2,
+        rate: float = 0.14,
         tau: float = 4.0,
         samples: int = 1,
     ):

@@ -110,9 +110,12 @@ def test_nothing_is_random_in_the_paper() -> None:
     assert preset("default").random == RandomConfig()
 
 
-def test_preset_best_sees_every_sample_since_the_last_decision() -> None:
+def test_preset_best_sees_every_sample_of_three_decisions_once() -> None:
     task = preset("best").task
-    assert task.gyro_lags == task.accel_lags == tuple(range(task.sim_steps))
+    for lags in (task.gyro_lags, task.accel_lags):
+        seen = [lag + k for lag in lags for k in range(task.imu_mean)]
+        assert seen == list(range(3 * task.sim_steps))
+    assert task.command_lags == (0, 1, 2)
 
 
 def test_a_ramp_may_fill_its_whole_period() -> None:
