@@ -52,8 +52,8 @@ VARIANTS = {
     },
 }
 """Preset -> title -> flags."""
-DECISIONS = {"default": 30_000, "best": 100_000}
-SCENARIOS = {"default": 32, "best": 128}
+DECISIONS = {"default": 25_000, "best": 100_000}
+SCENARIOS = {"default": 24, "best": 128}
 
 
 def rows_of(name: str, args: argparse.Namespace) -> list[list[str]]:
