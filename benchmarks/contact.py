@@ -14,11 +14,14 @@ import mujoco
 import numpy as np
 
 from mjx_balance import evaluation, load_policy
-from mjx_balance.physics import LINE_SEARCH_ITERATIONS
 from mjx_balance.plant import View
 from mjx_balance.policy import Policy
+from mjx_balance.quiet import quiet_imports
 from mjx_balance.scene import Scene
 from mjx_balance.suites import make_scenarios
+
+with quiet_imports():
+    from mjx_balance.physics import LINE_SEARCH_ITERATIONS
 
 PYRAMIDAL = {"cone": float(mujoco.mjtCone.mjCONE_PYRAMIDAL)}
 VARIANTS: dict[str, dict[str, float]] = {
