@@ -15,7 +15,8 @@ IMU_CHANNELS = 6
 def observation_names(task: TaskConfig, robot: RobotConfig) -> tuple[str, ...]:
     """Name of every observation entry, in order, e.g. `H_LF`, `V_x,t-2`, `Acc_y,t-15`.
 
-    Commanded heights are `C_LF,d-1`: LF's of the decision before the latest.
+    Commanded heights are `C_LF,d-1`: LF's of the decision before the latest. With
+    `task.imu_mean` = 5, `V_x,t-10` is the mean of the samples 10 to 14 steps back.
     """
     names = [f"H_{leg}" for leg in robot.legs]
     names += [f"C_{leg},d-{lag}" for lag in task.command_lags for leg in robot.legs]
