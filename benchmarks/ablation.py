@@ -19,10 +19,10 @@ from markers import publish, table
 from mjx_balance.config import preset
 
 
-def lags(samples: Iterable[int], commands: str = "") -> str:
+def lags(samples: Iterable[int], commands: str) -> str:
     """Flags for IMU samples and commands that the network sees."""
     some = " ".join(str(lag) for lag in samples)
-    return f"--gyro-lags {some} --accel-lags {some} --command-lags {commands}".strip()
+    return f"--gyro-lags {some} --accel-lags {some} --command-lags {commands}"
 
 
 VARIANTS = {
