@@ -1,13 +1,15 @@
 """Measures policies and baselines on every suite and writes the README's tables.
 
-Every evaluation is kept in `--out` as soon as it is done, under the policy's
-fingerprint, so that an interrupted run goes on where it stopped. `--write` puts the
-tables between the markers of a Markdown file.
+Every evaluation is kept in `--out` as soon as it is done, under the fingerprint of the
+policy or of the baselines' source, so that an interrupted run goes on where it stopped.
+`--write` puts the tables between the markers of a Markdown file.
 
     python benchmarks/results.py policies/seeds/*.safetensors --write README.md
 """
 
 import argparse
+import hashlib
+import inspect
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -96,14 +98,17 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("policies", nargs="+")
     parser.add_argument("--scenarios", type=int, default=2000, help="of suites paper and corner")
-    parser.add_argument("--others", type=int, default=500, help="of the other suites")
-    parser.add_argument("--baselines", type=int, default=256, help="of every suite")
+    parser.add_argument(
+        "--others", type=int, default=500, help="of the other suites, and for pd-imu in all of them"
+    )
+    parser.add_argument("--baselines", type=int, default=64, help="for the other baselines")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results.json"))
     parser.add_argument("--write", type=Path, help="Markdown file with markers")
     args = parser.parse_args()
     policies = [load_policy(path) for path in args.policies]
     first = policies[0]
     scene, config = policy_scene(first), first.config
+    source = hashlib.sha256(Path(inspect.getfile(make_controller)).read_bytes()).hexdigest()[:8]
     networks: dict[str, list[dict[str, Any]]] = {}
     baselines: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in CONTROLLERS}
     for suite in SUITES:
@@ -122,11 +127,11 @@ def main() -> None:
         for name in CONTROLLERS:
             baselines[name][suite] = suite_result(
                 args.out,
-                name,
+                f"{name} {source}",
                 first,
                 lambda name=name: make_controller(name, scene, config),
                 suite,
-                args.baselines,
+                args.others if name == "pd-imu" else args.baselines,
             )
     shares = []
     for policy in policies:
@@ -143,8 +148,9 @@ def main() -> None:
     note = (
         f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval); "
         f"{args.scenarios:,} scenarios of {DURATION:g} s per seed in `paper` and `corner`, "
-        f"{args.others:,} in the others, {args.baselines:,} for the baselines, which are shown "
-        "by their mean tilt; seeds that training never sees. Fall-free share of the feasible "
+        f"{args.others:,} in the others; the baselines are shown by their mean tilt, `pd-imu` over "
+        f"{args.others:,} scenarios, the others over the first {args.baselines:,}; seeds that "
+        "training never sees. Fall-free share of the feasible "
         f"envelope: {min(shares):.2f} (worst seed). Commanded action while the board rests: "
         f"at most {settled:.3f} mm."
     )
