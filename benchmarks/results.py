@@ -37,6 +37,7 @@ from mjx_balance.suites import SUITES
 SEED = 7_000_000
 DURATION = 60.0
 MAIN = ("paper", "corner")
+BOARDS = ("fast", "steep")
 ENVELOPE_SCENARIOS, ENVELOPE_DURATION = 2, 30.0
 
 
@@ -99,9 +100,11 @@ def main() -> None:
     parser.add_argument("policies", nargs="+")
     parser.add_argument("--scenarios", type=int, default=2000, help="of suites paper and corner")
     parser.add_argument(
-        "--others", type=int, default=500, help="of the other suites, and for pd-imu in all of them"
+        "--others", type=int, default=500, help="of the suites with other circumstances, and pd-imu"
     )
-    parser.add_argument("--baselines", type=int, default=64, help="for the other baselines")
+    parser.add_argument(
+        "--rest", type=int, default=64, help="of suites fast and steep, and the other baselines"
+    )
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results.json"))
     parser.add_argument("--write", type=Path, help="Markdown file with markers")
     args = parser.parse_args()
@@ -112,7 +115,8 @@ def main() -> None:
     networks: dict[str, list[dict[str, Any]]] = {}
     baselines: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in CONTROLLERS}
     for suite in SUITES:
-        count = args.scenarios if suite in MAIN else args.others
+        usual = args.rest if suite in BOARDS else args.others
+        count = args.scenarios if suite in MAIN else usual
         networks[suite] = [
             suite_result(
                 args.out,
@@ -131,7 +135,7 @@ def main() -> None:
                 first,
                 lambda name=name: make_controller(name, scene, config),
                 suite,
-                args.others if name == "pd-imu" else args.baselines,
+                usual if name == "pd-imu" else args.rest,
             )
     shares = []
     for policy in policies:
@@ -146,13 +150,11 @@ def main() -> None:
         shares.append(Envelope(**measured(args.out, key, "envelope", measure)).fall_free_share)
     settled = max(r["action_mm_settled"] for suite in MAIN for r in networks[suite])
     note = (
-        f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval); "
-        f"{args.scenarios:,} scenarios of {DURATION:g} s per seed in `paper` and `corner`, "
-        f"{args.others:,} in the others; the baselines are shown by their mean tilt, `pd-imu` over "
-        f"{args.others:,} scenarios, the others over the first {args.baselines:,}; seeds that "
-        "training never sees. Fall-free share of the feasible "
-        f"envelope: {min(shares):.2f} (worst seed). Commanded action while the board rests: "
-        f"at most {settled:.3f} mm."
+        f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval), scenarios of "
+        f"{DURATION:g} s whose seeds training never sees. Baselines: mean tilt, `pd-imu` over "
+        f"{args.others:,} scenarios ({args.rest:,} in `fast` and `steep`), the others over the first "
+        f"{args.rest:,}. Fall-free share of the feasible envelope: {min(shares):.2f} (worst seed). "
+        f"Commanded action while the board rests: at most {settled:.3f} mm."
     )
     publish("results", [*suite_table(networks, baselines), "", note], args.write)
 
