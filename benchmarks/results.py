@@ -150,11 +150,11 @@ def main() -> None:
         shares.append(Envelope(**measured(args.out, key, "envelope", measure)).fall_free_share)
     settled = max(r["action_mm_settled"] for suite in MAIN for r in networks[suite])
     note = (
-        f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval), scenarios of "
-        f"{DURATION:g} s whose seeds training never sees. Baselines: mean tilt, `pd-imu` over "
-        f"{args.others:,} scenarios ({args.rest:,} in `fast` and `steep`), the others over the first "
-        f"{args.rest:,}. Fall-free share of the feasible envelope: {min(shares):.2f} (worst seed). "
-        f"Commanded action while the board rests: at most {settled:.3f} mm."
+        f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval), scenarios "
+        f"of {DURATION:g} s whose seeds training never sees. Baselines: mean tilt, `pd-imu` over "
+        f"{args.others:,} scenarios ({args.rest:,} in `fast` and `steep`), the others over the "
+        f"first {args.rest:,}. Fall-free share of the feasible envelope: {min(shares):.2f} (worst "
+        f"seed). Commanded action while the board rests: at most {settled:.3f} mm."
     )
     publish("results", [*suite_table(networks, baselines), "", note], args.write)
 
