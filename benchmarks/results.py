@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from markers import publish, table
 from rich.console import Console
 
@@ -31,6 +32,7 @@ from mjx_balance.evaluation import (
     summarize,
 )
 from mjx_balance.policy import Policy
+from mjx_balance.report import ENVELOPE_DURATION, ENVELOPE_SCENARIOS
 from mjx_balance.statistics import TILTS, over_seeds
 from mjx_balance.suites import SUITES
 
@@ -38,7 +40,6 @@ SEED = 7_000_000
 DURATION = 60.0
 MAIN = ("paper", "corner")
 BOARDS = ("fast", "steep")
-ENVELOPE_SCENARIOS, ENVELOPE_DURATION = 2, 30.0
 
 
 def measured(
@@ -62,15 +63,19 @@ def suite_result(
     make: Callable[[], Controller],
     suite: str,
     scenarios: int,
+    parts: tuple[int, ...],
 ) -> dict[str, Any]:
-    """Evaluates one controller on one suite."""
-    scene = policy_scene(policy)
+    """Evaluates one controller on one suite; `mean_of_first` has its mean tilt over `parts`."""
 
     def measure(bar: Any) -> dict[str, Any]:
+        scene = policy_scene(policy)
         rollout = run_suite(scene, policy.config, make(), suite, scenarios, DURATION, SEED, bar)
-        return summarize(rollout, suite, DURATION, SEED)
+        firsts = {str(n): float(rollout.tilt[:n].mean()) for n in parts if n <= scenarios}
+        return summarize(rollout, suite, DURATION, SEED) | {"mean_of_first": firsts}
 
-    key = f"{name} {scene.hash} ramp {policy.config.task.action_ramp} {suite} {scenarios}"
+    ramp = policy.config.task.action_ramp
+    key = f"{name}, scene {policy.scene_hash}, ramp {ramp}, {suite}, {scenarios} x {DURATION:g} s"
+    key += f", seed {SEED}"
     return measured(out, key, f"{name}, {suite}, {scenarios} scenarios", measure)
 
 
@@ -87,8 +92,10 @@ def suite_table(
         cells.append(" / ".join(f"{row[x]['worst']:.3f}" for x in TILTS))
         for name in names:
             result = baselines[name][suite]
-            fell = f" ({result['falls']} fall)" if result["falls"] else ""
-            cells.append(f"{result['tilt_deg']['mean']:.3f}{fell}")
+            mean, same = result["tilt_deg"]["mean"], str(result["scenarios"])
+            more = mean - np.mean([r["mean_of_first"][same] for r in results])
+            fell = f", {result['falls']} fall" if result["falls"] else ""
+            cells.append(f"{mean:.3f} ({more:+.3f}{fell})")
         rows.append(cells)
     columns = ["suite", "falls", "mean tilt deg", "p95", "max", "worst seed"]
     return table(columns + [f"`{name}`" for name in names], rows)
@@ -111,6 +118,7 @@ def main() -> None:
     policies = [load_policy(path) for path in args.policies]
     first = policies[0]
     scene, config = policy_scene(first), first.config
+    parts = (args.rest, args.others)
     source = hashlib.sha256(Path(inspect.getfile(make_controller)).read_bytes()).hexdigest()[:8]
     networks: dict[str, list[dict[str, Any]]] = {}
     baselines: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in CONTROLLERS}
@@ -125,6 +133,7 @@ def main() -> None:
                 lambda policy=policy: observing(policy),
                 suite,
                 count,
+                parts,
             )
             for policy in policies
         ]
@@ -136,6 +145,7 @@ def main() -> None:
                 lambda name=name: make_controller(name, scene, config),
                 suite,
                 usual if name == "pd-imu" else args.rest,
+                parts,
             )
     shares = []
     for policy in policies:
@@ -146,15 +156,18 @@ def main() -> None:
             )
             return vars(found)
 
-        key = f"envelope {policy.fingerprint} {ENVELOPE_SCENARIOS}"
+        key = f"envelope of policy {policy.fingerprint}, scene {scene.hash}, "
+        key += f"{ENVELOPE_SCENARIOS} x {ENVELOPE_DURATION:g} s, seed {SEED}"
         shares.append(Envelope(**measured(args.out, key, "envelope", measure)).fall_free_share)
-    settled = max(r["action_mm_settled"] for suite in MAIN for r in networks[suite])
+    settled = max(r["action_mm_settled"] for results in networks.values() for r in results)
     note = (
         f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval), scenarios "
-        f"of {DURATION:g} s whose seeds training never sees. Baselines: mean tilt, `pd-imu` over "
-        f"{args.others:,} scenarios ({args.rest:,} in `fast` and `steep`), the others over the "
-        f"first {args.rest:,}. Fall-free share of the feasible envelope: {min(shares):.2f} (worst "
-        f"seed). Commanded action while the board rests: at most {settled:.3f} mm."
+        f"of {DURATION:g} s whose seeds training never sees. Baselines: mean tilt, and how much "
+        "more that is than the networks' mean over the same scenarios: `pd-imu` over the first "
+        f"{args.others:,} ({args.rest:,} in `fast` and `steep`), the others over the first "
+        f"{args.rest:,}. Fall-free share of the feasible envelope: {min(shares):.2f} (worst seed). "
+        "Commanded action while the board rests, greatest mean of a suite and seed: "
+        f"{settled:.3f} mm."
     )
     publish("results", [*suite_table(networks, baselines), "", note], args.write)
 

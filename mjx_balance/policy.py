@@ -104,10 +104,10 @@ class Policy:
     @property
     def fingerprint(self) -> str:
         """Short digest of the weights."""
-        digest = hashlib.sha256()
-        for kernel, bias in self._layers:
-            digest.update(kernel.tobytes() + bias.tobytes())
-        return digest.hexdigest()[:16]
+        arrays = [array for layer in self._layers for array in layer]
+        if self.radial:
+            arrays += [self._profile, self._stretch]
+        return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
     def q_values(self, obs: np.ndarray) -> np.ndarray:
         """Action values.
