@@ -8,7 +8,10 @@ puts the tables between the markers of a Markdown file.
 """
 
 import argparse
+import hashlib
 import json
+import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -60,19 +63,22 @@ def rows_of(name: str, args: argparse.Namespace) -> list[list[str]]:
     """Trains what is missing of a preset's variants; returns the rows that there are."""
     rows = []
     for number, (title, flags) in enumerate(VARIANTS[name].items()):
-        folder = args.runs / f"{name}-{number:02}-{DECISIONS[name]}-seed{args.seed}"
+        common = (
+            f"--preset {name} --num-env-steps {DECISIONS[name]} --seed {args.seed} "
+            f"--eval-scenarios {SCENARIOS[name]} --checkpoint-every {DECISIONS[name]}"
+        )
+        digest = hashlib.sha256(f"{common} {flags}".encode()).hexdigest()[:8]
+        slug = "-".join(re.findall("[a-z0-9.]+", title.lower()))
+        folder = args.runs / f"{name}-{slug}-{digest}"
         result = folder / "evaluation.json"
         wanted = args.only is None or f"{name}-{number}" in args.only
         if wanted and not result.is_file():
-            start = ["--resume", str(folder)] if folder.exists() else ["--run-dir", str(folder)]
-            common = (
-                f"--preset {name} --num-env-steps {DECISIONS[name]} --seed {args.seed} "
-                f"--eval-scenarios {SCENARIOS[name]} --checkpoint-every {DECISIONS[name]}"
-            )
-            train = [sys.executable, "-m", "mjx_balance", "train", *start]
-            # A resumed run takes its flags from its folder.
-            more = [] if folder.exists() else [*common.split(), *flags.split()]
-            subprocess.run(train + more, check=True)
+            if any(folder.glob("checkpoints/*")):  # it has the flags in its folder
+                more = ["--resume", str(folder)]
+            else:
+                shutil.rmtree(folder, ignore_errors=True)
+                more = ["--run-dir", str(folder), *common.split(), *flags.split()]
+            subprocess.run([sys.executable, "-m", "mjx_balance", "train", *more], check=True)
         if not result.is_file():
             continue
         suites = json.loads(result.read_text())

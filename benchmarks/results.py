@@ -8,8 +8,6 @@ policy or of the baselines' source, so that an interrupted run goes on where it 
 """
 
 import argparse
-import hashlib
-import inspect
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +30,7 @@ from mjx_balance.evaluation import (
     summarize,
 )
 from mjx_balance.policy import Policy
-from mjx_balance.report import ENVELOPE_DURATION, ENVELOPE_SCENARIOS
+from mjx_balance.report import ENVELOPE_DURATION, ENVELOPE_SCENARIOS, baselines_digest
 from mjx_balance.statistics import TILTS, over_seeds
 from mjx_balance.suites import SUITES
 
@@ -119,7 +117,6 @@ def main() -> None:
     first = policies[0]
     scene, config = policy_scene(first), first.config
     parts = (args.rest, args.others)
-    source = hashlib.sha256(Path(inspect.getfile(make_controller)).read_bytes()).hexdigest()[:8]
     networks: dict[str, list[dict[str, Any]]] = {}
     baselines: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in CONTROLLERS}
     for suite in SUITES:
@@ -140,7 +137,7 @@ def main() -> None:
         for name in CONTROLLERS:
             baselines[name][suite] = suite_result(
                 args.out,
-                f"{name} {source}",
+                f"{name} {baselines_digest()}",
                 first,
                 lambda name=name: make_controller(name, scene, config),
                 suite,

@@ -126,6 +126,8 @@ def _evaluate(argv: list[str]) -> int:
         for path in (args.json, args.video):
             if path is not None and not path.absolute().parent.is_dir():
                 return _complain(f"cannot write {path}: its folder does not exist")
+        if args.video is not None and args.video.suffix != ".mp4":
+            return _complain(f"video is {args.video}; its name must end in .mp4")
         if (args.policy is None) == (args.controller is None):
             return _complain("name a policy file or --controller NAME, one of the two")
         if args.policy is not None:

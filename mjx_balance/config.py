@@ -354,6 +354,9 @@ def check(config: Config) -> Config:
                 raise ConfigError(f"{field.name} is {value}; it must be a finite number")
             if type(field.default) is int and type(value) is not int:
                 raise ConfigError(f"{field.name} is {value!r}; it must be a whole number")
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if field.name in _POSITIVE | _NOT_NEGATIVE | _UNIT and not number:
+                raise ConfigError(f"{field.name} is {value!r}; it must be a number")
             if field.name in _NOT_NEGATIVE and value < 0:
                 raise ConfigError(f"{field.name} is {value}; it must not be negative")
             if field.name in _POSITIVE and value <= 0:
@@ -362,6 +365,8 @@ def check(config: Config) -> Config:
                 raise ConfigError(f"{field.name} is {value}; it must lie between 0 and 1")
     if config.preset not in PRESETS:
         preset(config.preset)
+    if config.seed + config.num_seeds > 2**31:
+        raise ConfigError(f"seed is {config.seed}; the last of all seeds must be less than 2**31")
     if sorted(robot.legs) != sorted(LEGS):
         raise ConfigError(f"legs is {robot.legs}; it must name each of {', '.join(LEGS)} once")
     if task.reward_tilt not in REWARD_TILTS:
@@ -470,8 +475,10 @@ def from_dict(kind: type[T], values: Mapping[str, Any]) -> T:
     """Rebuilds the config section `kind` from `to_dict`'s values.
 
     Raises:
-      ConfigError: for a field that `kind` does not have.
+      ConfigError: for a field that `kind` does not have, or what is no section at all.
     """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{kind.__name__} is {values!r}; it must map its fields to values")
     fields = {f.name: f for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]
     unknown = sorted(set(values) - set(fields))
     if unknown:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import psutil
 from mujoco.batch import Batch
 
 from mjx_balance.config import Config, RandomConfig, greatest_incline
@@ -30,6 +31,10 @@ Controller = Callable[[View], np.ndarray]
 
 SETTLED_SECONDS = 3.0
 """End of every target's period in which the board has long been at rest, s."""
+
+
+TILT_COPIES = 3
+"""Arrays of every scenario's tilt at every step that a summary needs at once, float64."""
 
 
 class EvaluationError(ValueError):
@@ -249,13 +254,21 @@ def run_suite(
     """Rolls a controller out on a suite's scenarios.
 
     Raises:
-      EvaluationError: if there are no scenarios or no time.
-      SuiteError: for an unknown suite.
+      EvaluationError: if there are no scenarios or no time, or too much for the memory.
+      SuiteError: as `make_scenarios`.
     """
     if scenarios < 1:
         raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
     if not (np.isfinite(duration) and duration > 0):
         raise EvaluationError(f"duration is {duration}; it must be a number of seconds above 0")
+    steps = scenarios * duration / config.task.sim_dt
+    needed = 8 * steps * (TILT_COPIES + (scene.model.nq if record else 0))
+    available = psutil.virtual_memory().available
+    if needed > available:
+        raise EvaluationError(
+            f"scenarios is {scenarios} and duration {duration:g} s: that takes about "
+            f"{needed / 2**30:,.1f} GiB, and {available / 2**30:.1f} GiB are free; lower one"
+        )
     drawn, conditions = make_scenarios(config, suite, scenarios, duration, seed)
     return roll_out(
         scene,
@@ -321,6 +334,11 @@ def envelope(
     if scenarios < 1:
         raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
     cells = [(i, r) for i in ENVELOPE_INCLINES for r in ENVELOPE_RATES]
+    # So that even the slowest board arrives; `corner` alone needs less.
+    slowest = 2 * max(ENVELOPE_INCLINES) / min(ENVELOPE_RATES)
+    task = config.task
+    period = max(task.target_period, slowest)
+    config = dataclasses.replace(config, task=dataclasses.replace(task, target_period=period))
     drawn, _ = make_scenarios(config, "corner", len(cells) * scenarios, duration, seed)
     incline, rate = np.repeat(np.asarray(cells), scenarios, axis=0).T
     signs = np.sign(drawn.targets)

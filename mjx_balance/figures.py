@@ -61,6 +61,17 @@ def draw_figures(run_dir: Path, policy: Policy) -> list[Path]:
     return [figures / name for name in drawn]
 
 
+CURVES = (
+    ("train/tilt_deg", "mean body tilt [deg]", "log"),
+    ("train/falls_per_minute", "falls per robot-minute", "symlog"),
+    ("train/reward", "reward per decision", "linear"),
+    ("train/loss", "squared TD error", "log"),
+    ("train/epsilon", "epsilon", "linear"),
+    ("perf/env_steps_per_second", "decisions per second", "linear"),
+)
+"""Metric, title and scale of each panel of the learning curves."""
+
+
 def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
     """Tilt, falls, reward, loss, epsilon and speed over the decisions.
 
@@ -68,26 +79,21 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
       runs: the lines of metrics.jsonl of each run. Where a line has values per seed, or
         there are several runs, a line shows the median and a band the extremes.
     """
-    panels = (
-        ("train/tilt_deg", "mean body tilt [deg]", "log"),
-        ("train/falls_per_minute", "falls per robot-minute", "symlog"),
-        ("train/reward", "reward per decision", "linear"),
-        ("train/loss", "squared TD error", "log"),
-        ("train/epsilon", "epsilon", "linear"),
-        ("perf/env_steps_per_second", "decisions per second", "linear"),
-    )
     figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
-    longest = max(runs, key=len)
-    steps = np.asarray([m["env_steps"] for m in longest]) / 1000
-    for axis, (name, title, scale) in zip(axes.flat, panels, strict=True):
-        curves = [curve for run in runs for curve in _seed_curves(run, name)]
-        values = np.full((len(curves), len(steps)), np.nan)
-        for row, curve in zip(values, curves, strict=True):
-            row[: len(curve)] = curve
+    longest = max(runs, key=lambda run: run[-1]["env_steps"])
+    steps = np.asarray([m["env_steps"] for m in longest])
+    for axis, (name, title, scale) in zip(axes.flat, CURVES, strict=True):
+        values = np.asarray(
+            [
+                np.interp(steps, [m["env_steps"] for m in run], curve, np.nan, np.nan)
+                for run in runs
+                for curve in _seed_curves(run, name)
+            ]
+        )
         if scale == "log":
             values = np.where(values > 0, values, np.nan)  # no update yet, no loss
         shown = np.isfinite(values).any(axis=0)
-        at, values = steps[shown], values[:, shown]
+        at, values = steps[shown] / 1000, values[:, shown]
         if len(values) > 1:
             low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
             axis.fill_between(at, low, high, color=BLUE, alpha=0.2, lw=0)

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import hashlib
 import html
 import io
 import json
@@ -16,7 +17,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from mjx_balance import figures, render
+from mjx_balance import baselines, figures, render
 from mjx_balance.baselines import CONTROLLERS, make_controller
 from mjx_balance.config import Config, check, flatten, from_dict, preset, to_dict
 from mjx_balance.evaluation import (
@@ -118,16 +119,18 @@ class Run:
     config: Config | None = None
     metrics: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     policy: Policy | None = None
-    evaluation: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
-    seeds: dict[str, Any] | None = None
+    results: list[dict[str, dict[str, Any]]] = dataclasses.field(default_factory=list)
+    """The run's own evaluation, suite -> JSON, of each of its seeds."""
 
 
 def read_run(path: Path) -> Run:
     """Reads what there is.
 
     Raises:
-      ReportError: if nothing in the folder belongs to a run.
+      ReportError: if there is no folder, or nothing of a run in it.
     """
+    if not path.is_dir():
+        raise ReportError(f"{path} is no folder; `mjx-balance train` makes one for each run")
     if not any((path / name).is_file() for name in PARTS):
         raise ReportError(
             f"{path} is no run folder: it has none of {', '.join(PARTS)}; "
@@ -142,24 +145,52 @@ def read_run(path: Path) -> Run:
             return None
         try:
             return parse(file)
-        except (ValueError, KeyError, TypeError, OSError) as error:
+        except KeyError as error:
+            run.missing.append(f"{file} cannot be used: it has no {error}")
+        except (ValueError, TypeError, AttributeError, OSError) as error:
             run.missing.append(f"{file} cannot be used: {error}")
-            return None
+        return None
 
     run.config = read("config.json", lambda f: check(from_dict(Config, json.loads(f.read_text()))))
-    run.metrics = read("metrics.jsonl", _read_metrics) or []
+    run.metrics = read("metrics.jsonl", lambda f: _read_metrics(f, run.missing)) or []
     run.policy = read("policy.safetensors", load_policy)
-    run.evaluation = read("evaluation.json", lambda f: json.loads(f.read_text())) or {}
+    own = read("evaluation.json", lambda f: _checked(json.loads(f.read_text())))
+    run.results = [own] if own else []
     if (path / "seeds.json").is_file():
-        run.seeds = read("seeds.json", lambda f: json.loads(f.read_text()))
+        run.results = read("seeds.json", _read_seeds) or run.results
+    if not (run.config or run.metrics or run.policy or run.results):
+        raise ReportError(f"{path} is no run folder: {'; '.join(run.missing)}")
     return run
 
 
-def _read_metrics(file: Path) -> list[dict[str, Any]]:
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
-    if not lines:
-        raise ValueError("it holds no line yet")
+def _read_metrics(file: Path, missing: list[str]) -> list[dict[str, Any]]:
+    """The lines up to the first that cannot be used, as a crash leaves one."""
+    lines: list[dict[str, Any]] = []
+    for number, text in enumerate(file.read_text().splitlines(), 1):
+        try:
+            line = json.loads(text)
+            for name in ("env_steps", *(name for name, _, _ in figures.CURVES)):
+                float(line[name])
+            seeds = {name: len(values) for name, values in line.get("seeds", {}).items()}
+            if lines and seeds != {name: len(x) for name, x in lines[0].get("seeds", {}).items()}:
+                raise ValueError("other seeds than in line 1")
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+            missing.append(f"{file} is shown up to line {number}, which cannot be used: {what}")
+            break
+        lines.append(line)
     return lines
+
+
+def _read_seeds(file: Path) -> list[dict[str, dict[str, Any]]]:
+    return [_checked(row["evaluation"]) for row in json.loads(file.read_text())["seeds"]]
+
+
+def _checked(results: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Returns a run's evaluation if it has what the report takes from it."""
+    for result in results.values():
+        over_seeds([result])
+    return results
 
 
 def write_report(
@@ -193,15 +224,15 @@ def write_report(
         try:
             scene = policy_scene(shown.policy)
             data = _measure(shown, scene, scenarios, progress)
-            parts += _summary(runs, shown.policy, data)
+            parts += _summary(shown.policy, data) + _seeds(shown, runs)
             parts += _pictures(shown.policy, scene, data, missing)
         except PolicyError as error:
             missing.append(f"{shown.path}: {error}")
     curves = [run.metrics for run in runs if run.metrics]
     if curves:
         caption = (
-            "Training. The line is the median over the seeds, the band their extremes; tilt, falls "
-            "and reward are those of the exploring policy."
+            "Training. The line is the median over runs and seeds, the band their extremes; tilt, "
+            "falls and reward are those of the exploring policy."
         )
         parts.append(_figure("Learning curves", figures.learning_curves(curves), caption))
     config = next((run.config for run in runs if run.config is not None), None)
@@ -209,7 +240,7 @@ def write_report(
         reward = figures.reward_figure(config.task)
         parts.append(_figure("Reward (Fig. 4 and 5 of the paper)", reward, _reward_caption(config)))
         parts.append(_config(config))
-    parts.append(_reproduce(runs, config, out))
+    parts.append(_reproduce(runs, out))
     notes = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in missing)
     if notes:
         parts.insert(0, f'<section class="missing"><h2>Missing</h2><ul>{notes}</ul></section>')
@@ -219,18 +250,24 @@ def write_report(
     return missing
 
 
+def baselines_digest() -> str:
+    """Digest of the baselines' source: with it, what was measured of them holds."""
+    return hashlib.sha256(Path(baselines.__file__).read_bytes()).hexdigest()[:8]
+
+
 def _measure(
     run: Run, scene: Scene, scenarios: int, progress: Callable[[str], Any]
 ) -> dict[str, Any]:
     """Policy and baselines on the same scenarios; read back if it was done before."""
     assert run.policy is not None
     config, file = run.policy.config, run.path / CACHE
-    key = [run.policy.fingerprint, scenarios, DURATION, SEED]
+    key = [run.policy.fingerprint, scene.hash, baselines_digest()]
+    key += [scenarios, DURATION, SEED, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
     try:
         saved = json.loads(file.read_text())
         if saved["key"] == key:
             return saved
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         pass
     data: dict[str, Any] = {"key": key, "results": {}, "histogram": {}}
     for name in ("policy", *CONTROLLERS):
@@ -255,8 +292,8 @@ def _measure(
     return data
 
 
-def _summary(runs: list[Run], policy: Policy, data: dict[str, Any]) -> list[str]:
-    """Headline figures, the table against the baselines, and the seeds if there are several."""
+def _summary(policy: Policy, data: dict[str, Any]) -> list[str]:
+    """Headline figures and the table against the baselines."""
     results = data["results"]
     mapped = Envelope(**data["envelope"])
     ours = results["policy"]
@@ -290,7 +327,7 @@ def _summary(runs: list[Run], policy: Policy, data: dict[str, Any]) -> list[str]
         mark = ' class="ours"' if name == "policy" else ""
         rows.append(f"<tr{mark}>{''.join(cells)}</tr>")
     count = ours["paper"]["scenarios"]
-    parts = [
+    return [
         f'<div class="tiles">{shown}</div>',
         "<section><h2>Against the baselines</h2><table><thead><tr><th rowspan=2></th>"
         "<th rowspan=2>sees</th><th colspan=4>suite <i>paper</i></th><th colspan=4>suite <i>"
@@ -304,17 +341,20 @@ def _summary(runs: list[Run], policy: Policy, data: dict[str, Any]) -> list[str]
         "The paper gives no figures; it reports a high peak of the tilt when the board turns on "
         "both axes at once, and that its controller cannot handle that.</p></section>",
     ]
-    several = [run for run in runs if run.seeds is not None]
-    each = [run.evaluation for run in runs if run.evaluation]
-    if several and several[0].seeds is not None:
-        parts.append(_seeds(several[0].seeds["statistics"]))
-    elif len(each) > 1:
-        shared = [suite for suite in SUITES if all(suite in result for result in each)]
-        parts.append(_seeds({s: over_seeds([result[s] for result in each]) for s in shared}))
-    return parts
 
 
-def _seeds(statistics: dict[str, Any]) -> str:
+def _seeds(shown: Run, runs: list[Run]) -> list[str]:
+    """The table over the training seeds of `shown` and of the runs that differ in seed alone."""
+
+    def recipe(run: Run) -> Config | None:
+        return run.config and dataclasses.replace(run.config, seed=0, num_seeds=1)
+
+    alike = [run for run in runs if run is shown or (run.config and recipe(run) == recipe(shown))]
+    each = [result for run in alike for result in run.results]
+    if len(each) < 2:
+        return []
+    shared = [suite for suite in SUITES if all(suite in result for result in each)]
+    statistics = {suite: over_seeds([result[suite] for result in each]) for suite in shared}
     rows = "".join(
         f"<tr><td><b>{suite}</b></td><td>{row['seeds']}</td><td>{row['falls']} of "
         f"{row['scenarios']}</td>"
@@ -325,12 +365,12 @@ def _seeds(statistics: dict[str, Any]) -> str:
         for suite, row in statistics.items()
     )
     heads = "".join(f"<th>{name}</th><th>worst seed</th>" for name in TILTS)
-    return (
+    return [
         "<section><h2>Over the training seeds</h2><table><thead><tr><th>suite</th><th>seeds</th>"
         f"<th>falls</th>{heads}</tr></thead><tbody>{rows}</tbody></table><p>Interquartile mean "
         "over the seeds and its 95% bootstrap interval, tilt in degrees, each run's own evaluation."
         "</p></section>"
-    )
+    ]
 
 
 def _pictures(policy: Policy, scene: Scene, data: dict[str, Any], missing: list[str]) -> list[str]:
@@ -420,11 +460,8 @@ def _config(config: Config) -> str:
     )
 
 
-def _reproduce(runs: list[Run], config: Config | None, out: Path) -> str:
-    lines = []
-    if config is not None:
-        seeds = f" --num-seeds {config.num_seeds}" if config.num_seeds > 1 else ""
-        lines.append(f"mjx-balance train --preset {config.preset} --seed {config.seed}{seeds}")
+def _reproduce(runs: list[Run], out: Path) -> str:
+    lines = [_train_command(run.config) for run in runs if run.config is not None]
     for run in runs:
         if run.policy is not None:
             lines.append(f"mjx-balance evaluate {run.path / 'policy.safetensors'} --suite corner")
@@ -435,11 +472,23 @@ def _reproduce(runs: list[Run], config: Config | None, out: Path) -> str:
         listed = ", ".join(f"{k} {v}" for k, v in policy.manifest["versions"].items() if v)
         versions = f"<p>Versions of the training: {html.escape(listed)}.</p>"
     commands = html.escape("\n".join(lines))
-    extra = (
-        "<p>The config above holds every field that the preset does not: pass those that differ "
-        "as flags.</p>"
-    )
-    return f"<section><h2>Reproduce</h2><pre>{commands}</pre>{extra}{versions}</section>"
+    return f"<section><h2>Reproduce</h2><pre>{commands}</pre>{versions}</section>"
+
+
+def _train_command(config: Config) -> str:
+    """The command that trains with this config."""
+    theirs = flatten(to_dict(preset(config.preset)))
+    words = [f"mjx-balance train --preset {config.preset} --seed {config.seed}"]
+    for name, value in flatten(to_dict(config)).items():
+        if value == theirs[name] or name == "seed":
+            continue
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            some = value if isinstance(value, list) else [value]
+            words.append(" ".join([f"--{flag}", *map(str, some)]))
+    return " ".join(words)
 
 
 PAGE = """<!doctype html>

@@ -82,9 +82,12 @@ def make_scenarios(
     Scenario k of a seed is the same however many are drawn.
 
     Raises:
-      SuiteError: for an unknown suite.
+      SuiteError: for an unknown suite, a negative seed, or a board that does not arrive
+        before its next target.
     """
     chosen, task = find_suite(suite), config.task
+    if seed < 0:
+        raise SuiteError(f"seed is {seed}; it must not be negative")
     count = tilt.num_targets(task, duration)
     rngs = [np.random.default_rng((seed, k)) for k in range(scenarios)]
     uniform = np.asarray([rng.uniform(size=(count, 2)) for rng in rngs])
@@ -95,5 +98,11 @@ def make_scenarios(
     if chosen.steep:
         steepest = greatest_incline(task, config.robot)
         incline += np.maximum(steepest - task.max_incline, 0) * others[:, DRAWS + 1]
+    longest = float(np.max(2 * incline / rate))
+    if longest > task.target_period:
+        raise SuiteError(
+            f"target_period is {task.target_period} s, but in suite {suite!r} the board may take "
+            f"{longest:.1f} s to its target; the period must not be shorter"
+        )
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     return scenario, draw_conditions(chosen.random, config.robot, others[:, :DRAWS])

@@ -34,7 +34,7 @@ PROGRAM_BYTES = 1.3 * 2**30
 """Memory of a run besides its state: libraries, compiler, program (benchmarks/README.md)."""
 CPU_ENVS = 256
 ACCELERATOR_ENVS = 2048
-PER_SEED = ("tilt_deg", "reward", "loss")
+PER_SEED = ("tilt_deg", "falls_per_minute", "reward", "loss")
 """Metrics that are also logged for every seed, where there are several."""
 EVALUATED = ("paper", "corner")
 """Suites of the evaluation after training."""
@@ -223,9 +223,9 @@ def check_memory(config: Config, learner: Learner) -> None:
         available = (device.memory_stats() or {}).get("bytes_limit", math.inf)
     if needed > available:
         raise ConfigError(
-            f"num_seeds is {config.num_seeds}: that takes about {needed / 2**30:.1f} GiB, and "
-            f"{available / 2**30:.1f} GiB are free; train fewer seeds at once, or lower "
-            "replay_capacity"
+            f"num_seeds is {config.num_seeds}, num_envs {config.num_envs} and replay_capacity "
+            f"{config.dqn.replay_capacity}: that takes about {needed / 2**30:.1f} GiB, and "
+            f"{available / 2**30:.1f} GiB are free; lower one of them"
         )
 
 
@@ -329,6 +329,7 @@ def _learn(
             elapsed = time.perf_counter() - began
             seconds += elapsed
             raw = jax.device_get(raw)
+            raw["falls_per_minute"] = raw.pop("fall") * 60 / config.task.ctrl_dt
             mean = {name: float(np.mean(value)) for name, value in raw.items()}
             metrics = _named(config, mean, config.num_seeds * per_call / elapsed)
             line: dict[str, Any] = {
@@ -359,8 +360,6 @@ def _number(count: jax.Array) -> int:
 def _named(config: Config, raw: dict[str, float], rate: float) -> dict[str, float]:
     """Metrics under the names they are logged by."""
     metrics = {f"train/{name}": value for name, value in raw.items()}
-    falls = metrics.pop("train/fall")
-    metrics["train/falls_per_minute"] = falls * 60 / config.task.ctrl_dt
     metrics["perf/env_steps_per_second"] = rate
     metrics["perf/physics_steps_per_second"] = rate * config.task.sim_steps
     return metrics
@@ -384,7 +383,7 @@ def _export(
             "device": jax.devices()[0].device_kind,
             "date": time.strftime("%Y-%m-%d"),
         }
-        own = dataclasses.replace(config, seed=config.seed + k)
+        own = dataclasses.replace(config, seed=config.seed + k, num_seeds=1)
         manifest = make_manifest(own, env.scene.hash, action_factors(config, env), provenance)
         if config.num_seeds > 1:
             folder.seeds.mkdir(exist_ok=True)
@@ -488,8 +487,12 @@ def _stop_on_interrupt() -> Iterator[list[int]]:
 
 
 def _drop_metrics_after(path: Path, env_steps: int) -> None:
-    """Removes lines that a resumed run will write again."""
-    if path.is_file():
-        lines = path.read_text().splitlines()
-        kept = [x for x in lines if json.loads(x)["env_steps"] <= env_steps]
-        path.write_text("".join(f"{x}\n" for x in kept))
+    """Removes lines that a resumed run will write again, and what a crash left half-written."""
+    if not path.is_file():
+        return
+    kept = []
+    for text in path.read_text().splitlines():
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            if json.loads(text)["env_steps"] <= env_steps:
+                kept.append(f"{text}\n")
+    path.write_text("".join(kept))

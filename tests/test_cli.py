@@ -39,7 +39,9 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (("--max-incline", "12"), "max_incline is 12.0 deg"),
         (("--num-envs", "0"), "num_envs is 0"),
         (("--num-seeds", "0"), "num_seeds is 0"),
-        (("--num-seeds", "100000", "--num-envs", "64"), "num_seeds is 100000: that takes about"),
+        (("--num-seeds", "100000", "--num-envs", "64"), "num_seeds is 100000, num_envs 64 and"),
+        (("--replay-capacity", "4000000000"), "replay_capacity 4000000000: that takes about"),
+        (("--seed", "4294967296"), "seed is 4294967296"),
         (("--reward-tilt", "sideways"), "--reward-tilt"),
         (("--payload", "-1"), "payload is -1.0"),
         (("--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
@@ -110,7 +112,16 @@ def test_resuming_a_finished_run_is_refused(
         ),
         (("report",), "name at least one run folder"),
         (("report", "."), ". is no run folder: it has none of config.json"),
+        (("report", "nowhere"), "nowhere is no folder"),
         (("evaluate", "text", "--json", "no/such/out.json"), "cannot write no/such/out.json"),
+        (("evaluate", "--controller", "none", "--video", "text"), "video is text; its name must"),
+        (("evaluate", "--controller", "none", "--seed", "-1"), "seed is -1"),
+        (("evaluate", "--controller", "none", "--scenarios", "0"), "scenarios is 0"),
+        (
+            ("evaluate", "--controller", "none", "--scenarios", "100000000"),
+            "scenarios is 100000000 and duration 60 s: that takes about",
+        ),
+        (("evaluate", "--controller", "none", "--duration", "1e12"), "duration 1e+12 s: that"),
     ],
 )
 def test_impossible_commands_are_refused(
@@ -118,3 +129,4 @@ def test_impossible_commands_are_refused(
 ) -> None:
     (tmp_path / "text").write_text("this is no policy")
     assert named in refuse(capsys, *arguments)
+    assert (tmp_path / "text").read_text() == "this is no policy"

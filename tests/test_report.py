@@ -12,14 +12,20 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from mjx_balance import report
+from mjx_balance import figures, report
 from mjx_balance.cli import main
-from mjx_balance.config import Config, to_dict
+from mjx_balance.config import Config, preset, to_dict
 from mjx_balance.policy import make_manifest, save_policy
 from mjx_balance.scene import Scene
 
 ISOLATED = '"network_isolation_key":"file://'
 """How Chromium's network log marks what a page from disk asks for."""
+SHORTER = {
+    "DURATION": 3.0,
+    "ENVELOPE_SCENARIOS": 1,
+    "ENVELOPE_DURATION": 1.0,
+    "VIDEO_SECONDS": 1.0,
+}
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -50,11 +56,11 @@ def run(config: Config, scene: Scene, tmp_path_factory: pytest.TempPathFactory) 
     (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
     results = {suite: evaluation_result(suite, 0.1) for suite in ("paper", "corner")}
     (folder / "evaluation.json").write_text(json.dumps(results))
-    statistics = {
-        suite: report.over_seeds([evaluation_result(suite, t) for t in (0.1, 0.2)])
-        for suite in ("paper", "corner")
-    }
-    (folder / "seeds.json").write_text(json.dumps({"statistics": statistics}))
+    rows = [
+        {"evaluation": {suite: evaluation_result(suite, t) for suite in ("paper", "corner")}}
+        for t in (0.1, 0.2)
+    ]
+    (folder / "seeds.json").write_text(json.dumps({"seeds": rows}))
     layers: dict[str, Any] = {
         name: {"kernel": np.zeros((a, b)), "bias": np.zeros(b)}
         for name, a, b in (("hidden_0", 34, 64), ("hidden_1", 64, 64), ("head", 98, 3))
@@ -68,9 +74,8 @@ def run(config: Config, scene: Scene, tmp_path_factory: pytest.TempPathFactory) 
 @pytest.fixture(scope="module")
 def page(run: Path) -> Path:
     """The report on that folder, by the command."""
-    shorter = {"DURATION": 3.0, "ENVELOPE_SCENARIOS": 1, "ENVELOPE_DURATION": 1.0}
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (shorter | {"VIDEO_SECONDS": 1.0}).items():
+        for name, value in SHORTER.items():
             patch.setattr(report, name, value)
         assert main(("report", str(run), "--scenarios", "2")) == 0
     return run / "report.html"
@@ -87,7 +92,9 @@ def test_everything_is_there(page: Path) -> None:
     assert titles == expected.split("|"), "nothing is missing"
     for name in ("none", "pd-imu", "pd-attitude", "rate-oracle", "clairvoyant"):
         assert f"<b>{name}</b>" in text
-    assert "mjx-balance train --preset default --seed 0 --num-seeds 2" in text
+    assert "mjx-balance train --preset default --seed 0 " in text
+    assert " --num-seeds 2" in text
+    assert "<td>0.150 (0.100-0.200)</td><td>0.200</td>" in text, "over the two seeds"
     assert text.count("data:image/png;base64,") == 6
     assert "data:video/mp4;base64," in text
 
@@ -99,13 +106,22 @@ def test_the_page_needs_nothing_from_elsewhere(page: Path) -> None:
     assert "<script" not in text
 
 
-def test_measurements_are_kept_and_read_back(run: Path, page: Path) -> None:
+def test_measurements_are_kept_and_read_back(
+    run: Path, page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = json.loads((run / "report.json").read_text())
     for suites in data["results"].values():
         assert {r["scenarios"] for r in suites.values()} == {2}
     for suites in data["histogram"].values():
         for share in suites.values():
             assert sum(share) == pytest.approx(1.0)
+    shutil.copy(run / "policy.safetensors", tmp_path)
+    data["results"]["pd-imu"]["corner"]["tilt_deg"]["p95"] = 0.424
+    (tmp_path / "report.json").write_text(json.dumps(data))
+    for name, value in SHORTER.items():
+        monkeypatch.setattr(report, name, value)
+    assert main(("report", str(tmp_path), "--scenarios", "2")) == 0
+    assert "<td>0.424</td>" in (tmp_path / "report.html").read_text()
 
 
 def test_an_incomplete_folder_says_what_is_missing_and_shows_the_rest(
@@ -124,6 +140,61 @@ def test_an_incomplete_folder_says_what_is_missing_and_shows_the_rest(
     assert "policy.safetensors is missing" in text
     assert "<h2>Learning curves</h2>" in text
     assert "<h2>Config</h2>" in text
+
+
+GOOD_LINE = json.dumps(metrics_line(0, 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("config.json", "[]", "config.json cannot be used: Config is []; it must map"),
+        ("config.json", '{"task": []}', "config.json cannot be used: TaskConfig is []"),
+        ("config.json", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a number"),
+        ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_st', "metrics.jsonl is shown up to line 2"),
+        ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_steps": 9}}', "it has no 'train/tilt_deg'"),
+        ("metrics.jsonl", f"{GOOD_LINE}\n5", "metrics.jsonl is shown up to line 2"),
+        ("seeds.json", '{"best": 1}', "seeds.json cannot be used: it has no 'seeds'"),
+        ("seeds.json", "[1]", "seeds.json cannot be used"),
+        ("evaluation.json", '{"paper": {"falls": 0}}', "evaluation.json cannot be used: it has no"),
+        ("evaluation.json", '{"paper": 1}', "evaluation.json cannot be used"),
+    ],
+)
+def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: str, said: str
+) -> None:
+    (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
+    (tmp_path / name).write_text(content)
+    assert main(("report", str(tmp_path))) == 0
+    assert said in capsys.readouterr().err
+    assert "<h2>Learning curves</h2>" in (tmp_path / "report.html").read_text()
+
+
+def test_a_folder_with_somebody_elses_config_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "config.json").write_text('{"a": 1}')
+    assert main(("report", str(tmp_path))) == 2
+    assert "is no run folder: " in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["config.json"]
+
+
+def test_runs_that_log_at_other_intervals_share_one_axis() -> None:
+    often = [metrics_line(k, 1) for k in range(8)]
+    figure = figures.learning_curves([often, often[1::2]])
+    line = figure.axes[0].get_lines()[0]
+    np.testing.assert_allclose(line.get_xdata(), 1.024 * np.arange(1, 9))
+    np.testing.assert_allclose(line.get_ydata()[1::2], [m["train/tilt_deg"] for m in often[1::2]])
+
+
+def test_the_command_gives_every_field_that_the_preset_does_not() -> None:
+    best = preset("best")
+    dqn = dataclasses.replace(best.dqn, gamma=0.77, mirror=False, hidden_sizes=(8, 9))
+    command = report._train_command(dataclasses.replace(best, dqn=dqn, num_envs=64))
+    assert command == (
+        "mjx-balance train --preset best --seed 0 --num-envs 64 --gamma 0.77 --hidden-sizes 8 9 "
+        "--no-mirror"
+    )
 
 
 def test_a_foreign_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

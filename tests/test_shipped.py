@@ -33,7 +33,7 @@ def test_policy_fits_in_the_repository_and_to_the_scene(path: Path) -> None:
 @pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
 @pytest.mark.parametrize(
     ("suite", "mean", "most"),
-    [("corner", 0.13, 1.5), ("noise", 0.13, 1.5), ("payload", 0.13, 1.5), ("latency", 0.4, 4.0)],
+    [("corner", 0.12, 1.1), ("noise", 0.12, 1.1), ("payload", 0.12, 1.1), ("latency", 0.3, 2.5)],
 )
 def test_policy_balances(path: Path, suite: str, mean: float, most: float) -> None:
     """8 scenarios of 20 s; the figures of the README have more of both."""
@@ -41,7 +41,7 @@ def test_policy_balances(path: Path, suite: str, mean: float, most: float) -> No
     assert result["falls"] == 0
     assert result["tilt_deg"]["mean"] < mean
     assert result["tilt_deg"]["max"] < most
-    assert result["action_mm_settled"] < 0.3
+    assert result["action_mm_settled"] < 0.15
 
 
 def test_scenarios_of_the_check_do_tilt(config: Config, scene: Scene) -> None:
