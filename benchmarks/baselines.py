@@ -1,10 +1,11 @@
 """Tunes the PD baselines on training seeds, and measures what leg timing allows.
 
 Coordinate search: each parameter in turn is set to the best of a few values, until a
-round changes nothing. The score is the mean tilt over suite `paper`, falls counting as
-6 deg. The winners are the defaults in `mjx_balance/baselines.py`.
+round changes nothing. The score is the mean tilt over a suite, falls counting as 6 deg.
+The winners for suite `paper` are the defaults in `mjx_balance/baselines.py`; `--suite
+latency` shows what the same controllers reach if they are tuned for late actions instead.
 
-    python benchmarks/baselines.py [--scenarios 16] [--duration 40]
+    python benchmarks/baselines.py [--scenarios 16] [--duration 40] [--suite paper]
 
 With `--write`, instead: a table of what controllers reach when the legs take other shares
 of a decision to move, on held-out seeds, between the markers of a Markdown file.
@@ -27,12 +28,12 @@ from mjx_balance.scene import load_scene
 TRAINING_SEED, HELD_OUT_SEED = 5_000_000, 7_000_000
 GRIDS: Mapping[type, Mapping[str, Sequence[float]]] = {
     AttitudePD: {
-        "proportional": (0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6),
+        "proportional": (0.2, 0.4, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6),
         "rate": (0.08, 0.1, 0.12, 0.14, 0.16, 0.18, 0.2),
     },
     ImuPD: {
         "tau": (0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0),
-        "proportional": (0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4),
+        "proportional": (0.2, 0.4, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4),
         "rate": (0.0, 0.04, 0.08, 0.12, 0.14, 0.16, 0.18, 0.2, 0.22),
         "samples": (1, 3, 6, 12, 20),
     },
@@ -41,8 +42,8 @@ RAMPS = (0.02, 0.1, 0.2, 0.4, 0.6)
 TIMED = ("rate-oracle", "pd-attitude")
 
 
-def tune(scenarios: int, duration: float) -> None:
-    """Searches and prints every improvement."""
+def tune(scenarios: int, duration: float, suite: str) -> None:
+    """Searches, prints every improvement, and what the winner does on held-out seeds."""
     config = preset("default")
     scene = load_scene(config)
     for kind, grid in GRIDS.items():
@@ -51,14 +52,15 @@ def tune(scenarios: int, duration: float) -> None:
         chosen = {name: getattr(controller, name) for name in grid}
         scores: dict[tuple[float, ...], float] = {}
 
-        def score(trial: Mapping[str, float], kind=kind, scores=scores) -> float:
+        def mean(trial: Mapping[str, float], seed: int, kind=kind) -> float:
+            controller = kind(scene, config, **trial)
+            rollout = run_suite(scene, config, controller, suite, scenarios, duration, seed)
+            return float(rollout.tilt.mean())
+
+        def score(trial: Mapping[str, float], mean=mean, scores=scores) -> float:
             key = tuple(trial.values())
             if key not in scores:
-                controller = kind(scene, config, **trial)
-                rollout = run_suite(
-                    scene, config, controller, "paper", scenarios, duration, TRAINING_SEED
-                )
-                scores[key] = float(rollout.tilt.mean())
+                scores[key] = mean(trial, TRAINING_SEED)
             return scores[key]
 
         while True:
@@ -69,7 +71,8 @@ def tune(scenarios: int, duration: float) -> None:
             print(f"{kind.__name__}: {chosen} -> {score(chosen):.4f} deg", flush=True)
             if chosen == before:
                 break
-        print(f"{kind.__name__}: best of {len(scores)} trials", flush=True)
+        held_out = mean(chosen, HELD_OUT_SEED)
+        print(f"{kind.__name__}: best of {len(scores)}; held out {held_out:.4f} deg", flush=True)
 
 
 def leg_timing(scenarios: int, duration: float, page: Path) -> None:
@@ -100,12 +103,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--scenarios", type=int, default=16)
     parser.add_argument("--duration", type=float, default=40.0)
+    parser.add_argument("--suite", default="paper", help="to tune on")
     parser.add_argument("--write", type=Path, help="Markdown file with markers")
     args = parser.parse_args()
     if args.write:
         leg_timing(args.scenarios, args.duration, args.write)
     else:
-        tune(args.scenarios, args.duration)
+        tune(args.scenarios, args.duration, args.suite)
 
 
 if __name__ == "__main__":
