@@ -166,7 +166,10 @@ def read_run(path: Path) -> Run:
 def _read_metrics(file: Path, missing: list[str]) -> list[dict[str, Any]]:
     """The lines up to the first that cannot be used, as a crash leaves one."""
     lines: list[dict[str, Any]] = []
-    for number, text in enumerate(file.read_text().splitlines(), 1):
+    texts = file.read_text().splitlines()
+    if not texts:
+        raise ValueError("it holds no line yet")
+    for number, text in enumerate(texts, 1):
         try:
             line = json.loads(text)
             for name in ("env_steps", *(name for name, _, _ in figures.CURVES)):
@@ -351,9 +354,9 @@ def _seeds(shown: Run, runs: list[Run]) -> list[str]:
 
     alike = [run for run in runs if run is shown or (run.config and recipe(run) == recipe(shown))]
     each = [result for run in alike for result in run.results]
-    if len(each) < 2:
-        return []
     shared = [suite for suite in SUITES if all(suite in result for result in each)]
+    if len(each) < 2 or not shared:
+        return []
     statistics = {suite: over_seeds([result[suite] for result in each]) for suite in shared}
     rows = "".join(
         f"<tr><td><b>{suite}</b></td><td>{row['seeds']}</td><td>{row['falls']} of "

@@ -160,14 +160,21 @@ GOOD_LINE = json.dumps(metrics_line(0, 1))
         ("evaluation.json", '{"paper": 1}', "evaluation.json cannot be used"),
     ],
 )
-def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: str, said: str
+def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_read(
+    tmp_path: Path, name: str, content: str, said: str
 ) -> None:
     (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
     (tmp_path / name).write_text(content)
-    assert main(("report", str(tmp_path))) == 0
-    assert said in capsys.readouterr().err
-    assert "<h2>Learning curves</h2>" in (tmp_path / "report.html").read_text()
+    run = report.read_run(tmp_path)
+    assert said in "\n".join(run.missing)
+    assert run.metrics == [metrics_line(0, 1)]
+
+
+def test_metrics_without_a_line_are_said(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    (tmp_path / "metrics.jsonl").write_text("")
+    said = "\n".join(report.read_run(tmp_path).missing)
+    assert "metrics.jsonl cannot be used: it holds no line yet" in said
 
 
 def test_a_folder_with_somebody_elses_config_is_refused(
@@ -183,8 +190,9 @@ def test_runs_that_log_at_other_intervals_share_one_axis() -> None:
     often = [metrics_line(k, 1) for k in range(8)]
     figure = figures.learning_curves([often, often[1::2]])
     line = figure.axes[0].get_lines()[0]
-    np.testing.assert_allclose(line.get_xdata(), 1.024 * np.arange(1, 9))
-    np.testing.assert_allclose(line.get_ydata()[1::2], [m["train/tilt_deg"] for m in often[1::2]])
+    np.testing.assert_allclose(np.asarray(line.get_xdata()), 1.024 * np.arange(1, 9))
+    both = np.asarray(line.get_ydata())[1::2]
+    np.testing.assert_allclose(both, [m["train/tilt_deg"] for m in often[1::2]])
 
 
 def test_the_command_gives_every_field_that_the_preset_does_not() -> None:
