@@ -43,6 +43,8 @@ VIDEO_SECONDS = 12.0
 EDGES = np.concatenate(([0.0], np.geomspace(0.01, 6.0, 160), [6.0001]))
 """Bins of the tilt distribution, deg."""
 CACHE = "report.json"
+FOREIGN = (ValueError, KeyError, TypeError, AttributeError)
+"""What reading JSON that a run did not write may raise."""
 PARTS = ("config.json", "metrics.jsonl", "policy.safetensors", "evaluation.json")
 
 
@@ -145,11 +147,9 @@ def read_run(path: Path) -> Run:
             return None
         try:
             return parse(file)
-        except KeyError as error:
-            run.missing.append(f"{file} cannot be used: it has no {error}")
-        except (ValueError, TypeError, AttributeError, OSError) as error:
-            run.missing.append(f"{file} cannot be used: {error}")
-        return None
+        except (*FOREIGN, OSError) as error:
+            run.missing.append(f"{file} cannot be used: {_why(error)}")
+            return None
 
     run.config = read("config.json", lambda f: check(from_dict(Config, json.loads(f.read_text()))))
     run.metrics = read("metrics.jsonl", lambda f: _read_metrics(f, run.missing)) or []
@@ -161,6 +161,10 @@ def read_run(path: Path) -> Run:
     if not (run.config or run.metrics or run.policy or run.results):
         raise ReportError(f"{path} is no run folder: {'; '.join(run.missing)}")
     return run
+
+
+def _why(error: Exception) -> str:
+    return f"it has no {error}" if isinstance(error, KeyError) else str(error)
 
 
 def _read_metrics(file: Path, missing: list[str]) -> list[dict[str, Any]]:
@@ -177,9 +181,9 @@ def _read_metrics(file: Path, missing: list[str]) -> list[dict[str, Any]]:
             seeds = {name: len(values) for name, values in line.get("seeds", {}).items()}
             if lines and seeds != {name: len(x) for name, x in lines[0].get("seeds", {}).items()}:
                 raise ValueError("other seeds than in line 1")
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-            missing.append(f"{file} is shown up to line {number}, which cannot be used: {what}")
+        except FOREIGN as error:
+            why = _why(error)
+            missing.append(f"{file} is shown up to line {number}, which cannot be used: {why}")
             break
         lines.append(line)
     return lines
@@ -270,7 +274,7 @@ def _measure(
         saved = json.loads(file.read_text())
         if saved["key"] == key:
             return saved
-    except (OSError, ValueError, KeyError, TypeError):
+    except (*FOREIGN, OSError):
         pass
     data: dict[str, Any] = {"key": key, "results": {}, "histogram": {}}
     for name in ("policy", *CONTROLLERS):
