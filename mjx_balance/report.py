@@ -53,12 +53,9 @@ class ReportError(ValueError):
 
 
 def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
-    """A table for people: one row per suite."""
+    """A table for people, 80 columns: one row per suite."""
     title = "plain MuJoCo, tilt in deg over every physics step"
-    table = Table(
-        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
-    )
-    table.add_column("suite", style="bold", no_wrap=True)
+    table = _suites_table(title)
     shown = ("mean", "p50", "p95", "p99", "max")
     for name in ("scenarios", "falls", *shown, "act mm"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -74,18 +71,24 @@ def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
     return table
 
 
-def seeds_table(summary: dict[str, dict[str, Any]]) -> Table:
-    """A table for people: one row per suite, interquartile means over the seeds."""
-    title = "over the seeds: interquartile mean, 95% bootstrap interval, tilt in deg"
+def _suites_table(title: str) -> Table:
+    """One row per suite, its name in the first column; narrow."""
     table = Table(
-        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
     table.add_column("suite", style="bold", no_wrap=True)
-    for name in ("seeds", "falls", *TILTS):
+    return table
+
+
+def seeds_table(summary: dict[str, dict[str, Any]]) -> Table:
+    """A table for people, 80 columns: one row per suite, interquartile means over the seeds."""
+    seeds = max(row["seeds"] for row in summary.values())
+    title = f"{seeds} seeds: interquartile mean, 95% bootstrap interval, tilt in deg"
+    table = _suites_table(title)
+    for name in ("falls", *TILTS):
         table.add_column(name, justify="right", no_wrap=True)
     for suite, row in summary.items():
-        cells = (spread(row[name]) for name in TILTS)
-        table.add_row(suite, str(row["seeds"]), str(row["falls"]), *cells)
+        table.add_row(suite, str(row["falls"]), *(spread(row[name]) for name in TILTS))
     return table
 
 

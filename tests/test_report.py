@@ -1,6 +1,7 @@
 """The HTML report: complete, honest about what is missing, and quiet in a browser."""
 
 import dataclasses
+import io
 import json
 import re
 import shutil
@@ -11,6 +12,7 @@ from typing import Any
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+from rich.console import Console
 
 from mjx_balance import figures, report
 from mjx_balance.cli import main
@@ -203,6 +205,20 @@ def test_the_command_gives_every_field_that_the_preset_does_not() -> None:
         "mjx-balance train --preset best --seed 0 --num-envs 64 --gamma 0.77 --hidden-sizes 8 9 "
         "--no-mirror"
     )
+
+
+def test_tables_fit_an_80_column_terminal() -> None:
+    spread = {"iqm": 0.0684, "low": 0.0677, "high": 1.0687}
+    row = {"seeds": 5, "falls": 1280, "mean": spread, "p95": spread, "max": spread}
+    out = io.StringIO()
+    console = Console(width=80, file=out)
+    console.print(report.seeds_table({"friction": row}))
+    result = evaluation_result("friction", 0.1) | {"scenarios": 100_000, "duration_s": 60.0}
+    console.print(report.evaluation_table({"friction": result | {"action_mm_mean": 0.2}}))
+    text = out.getvalue()
+    assert text.count("0.068 (0.068-1.069)") == 3
+    assert "100000 x 60 s" in text
+    assert "…" not in text
 
 
 def test_a_foreign_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
