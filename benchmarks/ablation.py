@@ -48,6 +48,8 @@ VARIANTS = {
     },
     "best": {
         "as it is": "",
+        "reward for the tilt at the end": "--reward-tilt end",
+        "Double DQN": "--double",
         "two decisions of samples and commands": lags(range(0, 100, 5), "0 1"),
         "one decision": lags(range(0, 50, 5), "0"),
         "one decision, means over 40 ms": f"--imu-mean 10 {lags(range(0, 50, 10), '0')}",
