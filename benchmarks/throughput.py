@@ -88,7 +88,7 @@ def _random_program(learner, iterations: int) -> Callable[..., Any]:
     import jax
     import jax.numpy as jnp
 
-    from mjx_balance.dqn.learner import AXIS, REPLICATED, SHARDED
+    from mjx_balance.dqn.learner import AXIS, REPLICATED
 
     def step(state, key):
         key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
@@ -100,12 +100,13 @@ def _random_program(learner, iterations: int) -> Callable[..., Any]:
         state, _ = jax.lax.scan(step, state, jax.random.split(key, iterations))
         return state, jnp.zeros(())
 
+    sharded = learner.specs.env_state
     return jax.jit(
         jax.shard_map(
             program,
             mesh=learner.mesh,
-            in_specs=(SHARDED, REPLICATED),
-            out_specs=(SHARDED, REPLICATED),
+            in_specs=(sharded, REPLICATED),
+            out_specs=(sharded, REPLICATED),
             check_vma=False,
         )
     )

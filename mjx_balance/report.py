@@ -521,7 +521,8 @@ video {{ width: 48rem; border-radius: 6px; }}
 table {{ border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }}
 th, td {{ padding: .32rem .7rem; text-align: right; border-bottom: 1px solid #e3e8ef; }}
 th {{ font-weight: 600; color: #4b5768; }}
-td:first-child, td:nth-child(2), th:first-child {{ text-align: left; }}
+td:first-child, td:nth-child(2), tr:first-child th:nth-child(-n+2) {{ text-align: left; }}
+td:first-child {{ white-space: nowrap; }}
 tr.ours td {{ background: #eaf2fb; }}
 .tiles {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(13rem, 1fr)); gap: 1rem; }}
 .tiles div {{ background: #f4f7fa; border-radius: 8px; padding: 1rem 1.2rem; }}
