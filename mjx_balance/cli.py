@@ -14,6 +14,7 @@ from rich.console import Console
 from mjx_balance.config import Config, ConfigError, preset
 from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
+from mjx_balance.run_folder import RunFolderError, read_run_config
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -86,8 +87,6 @@ def _train(argv: list[str]) -> int:
         if known.resume is None:
             default = TrainArgs(config=preset(known.preset or "default"))
         else:
-            with quiet_imports():
-                from mjx_balance.training import read_run_config
             default = TrainArgs(config=read_run_config(known.resume))
     except ValueError as error:
         return _complain(str(error))
@@ -103,7 +102,7 @@ def _train(argv: list[str]) -> int:
     display = Display()
     try:
         training.train(parsed.config, parsed.run_dir, parsed.resume, display)
-    except (ConfigError, training.RunFolderError, CheckpointError) as error:
+    except (ConfigError, RunFolderError, CheckpointError) as error:
         return _complain(str(error))
     except training.Interrupted as stopped:
         display.say(str(stopped))

@@ -15,7 +15,13 @@ FLOORS = (
         *"task task.actions task.conditions task.legs task.observation task.reward".split(),
         *"task.symmetry task.tilt statistics".split(),
     ),
-    ("scene", "suites", "policy", *"dqn dqn.networks dqn.replay dqn.losses dqn.whitening".split()),
+    (
+        "scene",
+        "suites",
+        "policy",
+        "run_folder",
+        *"dqn dqn.networks dqn.replay dqn.losses dqn.whitening".split(),
+    ),
     ("plant", "dqn.learner"),
     ("physics", "baselines", "evaluation"),
     ("env", "render", "figures", "display", "checkpoint", "program_cache"),
@@ -26,8 +32,8 @@ FLOORS = (
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
-    "config quiet task scene suites plant policy baselines evaluation statistics render figures "
-    "report display".split()
+    "config quiet task scene suites plant policy run_folder baselines evaluation statistics render "
+    "figures report display".split()
 )
 JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
 
