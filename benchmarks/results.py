@@ -18,7 +18,7 @@ from markers import publish, table
 from rich.console import Console
 
 from mjx_balance import load_policy
-from mjx_balance.baselines import CONTROLLERS, make_controller
+from mjx_balance.controllers import CONTROLLERS, make_controller
 from mjx_balance.display import Display
 from mjx_balance.evaluation import (
     Controller,

@@ -115,7 +115,7 @@ def _train(argv: list[str]) -> int:
 def _evaluate(argv: list[str]) -> int:
     args = tyro.cli(EvaluateArgs, args=argv, prog="mjx-balance evaluate")
     from mjx_balance import evaluation, report
-    from mjx_balance.baselines import ControllerError, make_controller
+    from mjx_balance.controllers import ControllerError, make_controller
     from mjx_balance.display import Display
     from mjx_balance.scene import load_scene
     from mjx_balance.suites import SuiteError

@@ -9,10 +9,12 @@ import matplotlib as mpl
 import numpy as np
 
 from mjx_balance.config import Config, TaskConfig
-from mjx_balance.evaluation import Controller, Envelope, observing, policy_scene, run_suite
+from mjx_balance.controllers import Controller
+from mjx_balance.evaluation import Envelope, observing, policy_scene, run_suite
 from mjx_balance.policy import Policy
 from mjx_balance.scene import Scene
-from mjx_balance.task.reward import reward_terms, roll_pitch
+from mjx_balance.task.attitude import roll_pitch
+from mjx_balance.task.reward import reward_terms
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

@@ -20,11 +20,12 @@ import safetensors
 import safetensors.numpy
 
 from mjx_balance.config import Config, check, from_dict, to_dict
+from mjx_balance.robots import find_robot
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
 
 FORMAT = "mjx_balance.policy"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 
 
@@ -67,7 +68,7 @@ class Policy:
             scale = np.asarray(manifest["observation"]["scale"], np.float32)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise PolicyError(f"its manifest cannot be used: {error}") from error
-        task, robot = self.config.task, self.config.robot
+        task, robot = self.config.task, find_robot(self.config.robot)
         if self.actions.shape != (math.prod(self.factors), 2):
             raise PolicyError(
                 f"its action table has shape {self.actions.shape}; its network chooses among "
@@ -170,7 +171,7 @@ def make_manifest(
       factors: sizes of the network's action branches.
       training: provenance, e.g. decisions and seconds.
     """
-    task = config.task
+    task, robot = config.task, find_robot(config.robot)
     versions = {}
     for package in VERSIONED:
         try:
@@ -181,14 +182,15 @@ def make_manifest(
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "config": to_dict(config),
+        "robot": to_dict(robot),
         "network": {
             "hidden_sizes": list(config.dqn.hidden_sizes),
             "factors": list(factors),
             "radial": config.dqn.head == "radial",
         },
         "observation": {
-            "names": list(observation_names(task, config.robot)),
-            "scale": observation_scale(task, config.robot).tolist(),
+            "names": list(observation_names(task, robot)),
+            "scale": observation_scale(task, robot).tolist(),
             "height_offset_m": task.body_height,
             "imu_lag_s": task.sim_dt,
         },

@@ -17,11 +17,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from mjx_balance import baselines, figures, render
-from mjx_balance.baselines import CONTROLLERS, make_controller
+from mjx_balance import controllers, figures, render
 from mjx_balance.config import Config, check, flatten, from_dict, preset, to_dict
+from mjx_balance.controllers import CONTROLLERS, Controller, make_controller
 from mjx_balance.evaluation import (
-    Controller,
     Envelope,
     envelope,
     observing,
@@ -262,7 +261,7 @@ def write_report(
 
 def baselines_digest() -> str:
     """Digest of the baselines' source: with it, what was measured of them holds."""
-    return hashlib.sha256(Path(baselines.__file__).read_bytes()).hexdigest()[:8]
+    return hashlib.sha256(Path(controllers.__file__).read_bytes()).hexdigest()[:8]
 
 
 def _measure(

@@ -66,12 +66,9 @@ def size_to_device(config: Config) -> Config:
     """
     available = jax.devices()
     on_cpu = available[0].platform == "cpu"
-    num_envs, dqn = config.num_envs, config.dqn
+    num_envs = config.num_envs
     if num_envs is None:
         num_envs = CPU_ENVS if on_cpu else ACCELERATOR_ENVS
-        # More boards at once must not mean fewer updates per decision.
-        updates = dqn.updates_per_step * num_envs // CPU_ENVS
-        dqn = dataclasses.replace(dqn, updates_per_step=updates)
     if config.num_devices is None:
         # As many as share the boards and the batch out evenly.
         num_devices = next(
@@ -90,7 +87,7 @@ def size_to_device(config: Config) -> Config:
                 raise ConfigError(
                     f"{name} is {value}; it must be a multiple of num_devices, {num_devices}"
                 )
-    sized = dataclasses.replace(config, num_envs=num_envs, num_devices=num_devices, dqn=dqn)
+    sized = dataclasses.replace(config, num_envs=num_envs, num_devices=num_devices)
     return check(sized)
 
 

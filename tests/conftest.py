@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import Config, preset
+from mjx_balance.robots import Robot
+from mjx_balance.robots.quadruped import QUADRUPED
 from mjx_balance.scene import Scene, load_scene
 
 jax.config.update("jax_num_cpu_devices", 2)
@@ -23,6 +25,12 @@ def config() -> Config:
 def scene(config: Config) -> Scene:
     """The scene of the preset `default`; do not modify its model."""
     return load_scene(config)
+
+
+@pytest.fixture(scope="session")
+def robot() -> Robot:
+    """Our quadruped."""
+    return QUADRUPED
 
 
 @pytest.fixture(params=(np, jnp), ids=("numpy", "jax"))

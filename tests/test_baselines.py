@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from mjx_balance.baselines import (
     CONTROLLERS,
     ControllerError,
@@ -11,6 +10,7 @@ from mjx_balance.baselines import (
     make_controller,
     measure_response,
 )
+
 from mjx_balance.config import Config
 from mjx_balance.evaluation import run_suite, summarize
 from mjx_balance.scene import Scene

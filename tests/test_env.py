@@ -67,7 +67,7 @@ def run(env: BalanceEnv):
             after.info["truncation"],
             after.metrics["tilt_deg"],
             after.metrics["fall"],
-            state.info["imu"],
+            state.info["memory"].imu,
         )
         return state, seen
 

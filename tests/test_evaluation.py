@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mjx_balance.task.conditions import Conditions
 
 from mjx_balance.config import Config
 from mjx_balance.evaluation import (
@@ -22,7 +23,6 @@ from mjx_balance.evaluation import (
 from mjx_balance.policy import PolicyError, make_manifest, save_policy
 from mjx_balance.scene import Scene
 from mjx_balance.suites import SuiteError, make_scenarios
-from mjx_balance.task.conditions import Conditions
 from mjx_balance.task.tilt import Scenario
 
 STAND, LEFT_UP = 220, 20 * 21 + 10

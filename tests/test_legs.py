@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mjx_balance.task.legs import foot_heights, joint_angles, ramp
 
 from mjx_balance.config import Config, RobotConfig, TaskConfig
 from mjx_balance.scene import ROBOT, Scene
-from mjx_balance.task.legs import foot_heights, joint_angles, ramp
 
 ROBOTS = (RobotConfig(), RobotConfig(calf=0.19), RobotConfig(thigh=0.18, calf=0.23))
 

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_balance.config import Config, RandomConfig, preset
+from mjx_balance.config import Config, RandomizationConfig, preset
 from mjx_balance.env import BalanceEnv
 from mjx_balance.evaluation import roll_out
 from mjx_balance.task.actions import action_table, apply_action
-from mjx_balance.task.conditions import Conditions
+from mjx_balance.task.randomization import Conditions
 from mjx_balance.task.tilt import Scenario
 
 ENVS, DECISIONS = 32, 4
-RANDOM = RandomConfig(
+RANDOM = RandomizationConfig(
     gyro_noise=0.002,
     accel_noise=0.023,
     payload=5.0,

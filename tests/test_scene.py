@@ -7,9 +7,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from mjx_balance.plant import standing_heights
+from mjx_balance.task.legs import joint_angles
 
 from mjx_balance.config import Config, ConfigError
-from mjx_balance.plant import standing_heights
 from mjx_balance.scene import (
     BOARD,
     ROBOT,
@@ -20,7 +21,6 @@ from mjx_balance.scene import (
     scene_dir,
     scene_hash,
 )
-from mjx_balance.task.legs import joint_angles
 
 LEGS = ("LF", "RF", "LH", "RH")
 GEOM = mujoco.mjtGeom

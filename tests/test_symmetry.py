@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from mjx_balance.plant import View
 
 from mjx_balance.config import Config
 from mjx_balance.evaluation import roll_out
-from mjx_balance.plant import View
 from mjx_balance.scene import Scene
 from mjx_balance.suites import make_scenarios
 from mjx_balance.task.actions import action_table

@@ -105,11 +105,11 @@ def dither(key: jax.Array, action: jax.Array, factors: Sequence[int], levels: in
 
 
 def make_optimizer(config: DQNConfig, gradient_steps: int) -> optax.GradientTransformation:
-    """Adam with clipped gradients and a cosine from learning_rate to learning_rate_end."""
+    """Adam with clipped gradients and a cosine from learning_rate to its end_share."""
     schedule = optax.cosine_decay_schedule(
         config.learning_rate,
         max(gradient_steps, 1),
-        config.learning_rate_end / config.learning_rate,
+        config.learning_rate_end_share,
     )
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
 
@@ -168,7 +168,8 @@ class Learner:
         self.env, self.network, self.config = env, network, config
         self.num_envs, self.num_devices = num_envs, len(devices)
         self.iterations = -(-num_env_steps // num_envs)
-        self.optimizer = make_optimizer(config, self.iterations * config.updates_per_step)
+        self.updates = config.updates_per_step(num_envs)
+        self.optimizer = make_optimizer(config, self.iterations * self.updates)
         self.mesh = Mesh(np.asarray(devices), (AXIS,), axis_types=(AxisType.Auto,))
         self.trace_count = 0
         self.num_seeds = num_seeds
@@ -242,7 +243,7 @@ class Learner:
         )
 
     def iteration(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        """One decision of every env, then `updates_per_step` updates; runs on each device."""
+        """One decision of every env, then `self.updates` gradient steps; runs on each device."""
         key, key_act, key_reset, key_learn = jax.random.split(state.key, 4)
         rate = epsilon(self.config, state.env_steps)
         if self.config.whiten_steps:
@@ -259,12 +260,12 @@ class Learner:
         capacity = state.replay.data.action.shape[0]
         wanted = min(self.config.min_replay_size // self.num_devices, capacity)
         ready = state.replay.size >= wanted
-        keys = jax.random.split(self._device_key(key_learn), self.config.updates_per_step)
+        keys = jax.random.split(self._device_key(key_learn), self.updates)
         before = Knowledge(*(getattr(state, name) for name in Knowledge._fields))
         learnt, losses = jax.lax.cond(
             ready,
             lambda known: jax.lax.scan(partial(self._update, state.replay, whiten), known, keys),
-            lambda known: (known, jnp.zeros(self.config.updates_per_step)),
+            lambda known: (known, jnp.zeros(self.updates)),
             before,
         )
         state = state._replace(**learnt._asdict())
@@ -306,10 +307,10 @@ class Learner:
         q_values = self._q_values(state.params, whiten, _array(before.obs))
         keys = jax.random.split(self._device_key(key_act), count)
         action = jax.vmap(epsilon_greedy, (0, 0, None))(keys, q_values, rate)
-        if self.config.dither:
+        if self.config.exploration_noise:
             keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 1)
             factors = getattr(self.env, "action_factors", (self.env.action_size,))
-            move = partial(dither, factors=factors, levels=self.config.dither)
+            move = partial(dither, factors=factors, levels=self.config.exploration_noise)
             action = jax.vmap(move)(keys, action)
         after = jax.vmap(self.env.step)(before, action)
         truncation = after.info.get("truncation", jnp.zeros_like(after.done))

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_balance.config import RobotConfig, TaskConfig
+from mjx_balance.config import TaskConfig
+from mjx_balance.robots import Robot
 
 
 class Symmetries(NamedTuple):
@@ -18,7 +19,7 @@ class Symmetries(NamedTuple):
     """(g, num_actions) index that each action becomes, int32."""
 
 
-def symmetries(task: TaskConfig, robot: RobotConfig) -> Symmetries:
+def symmetries(task: TaskConfig, robot: Robot) -> Symmetries:
     """Reflections of the observation of Eq. 2 and the actions of Eq. 3.
 
     A reflection left-right swaps left and right legs and turns the signs of the roll
