@@ -263,17 +263,25 @@ def model_fields(scene: Scene, conditions: Conditions) -> dict[str, Array]:
 
 
 _HASHED = (
-    "body_mass body_inertia body_ipos body_iquat body_pos body_quat jnt_type jnt_axis "
-    "jnt_pos jnt_range jnt_limited jnt_solref jnt_stiffness qpos0 dof_armature "
-    "dof_damping dof_frictionloss actuator_gainprm actuator_biasprm actuator_forcerange "
-    "actuator_ctrlrange actuator_gear site_pos site_quat pair_friction pair_solref "
-    "pair_solimp pair_margin pair_gap pair_dim pair_solreffriction sensor_type "
-    "sensor_objid"
+    "body_parentid body_mass body_inertia body_ipos body_iquat body_pos body_quat "
+    "body_gravcomp jnt_type jnt_axis jnt_pos jnt_range jnt_limited jnt_solref jnt_solimp "
+    "jnt_margin jnt_stiffness jnt_actfrclimited jnt_actfrcrange qpos0 qpos_spring "
+    "dof_armature dof_damping dof_frictionloss dof_solref dof_solimp actuator_trntype "
+    "actuator_trnid actuator_dyntype actuator_dynprm actuator_gaintype actuator_gainprm "
+    "actuator_biastype actuator_biasprm actuator_forcelimited actuator_forcerange "
+    "actuator_ctrllimited actuator_ctrlrange actuator_gear site_bodyid site_pos site_quat "
+    "pair_friction pair_solref pair_solimp pair_margin pair_gap pair_dim pair_solreffriction "
+    "sensor_type sensor_objid sensor_cutoff"
+).split()
+_HASHED_OPTIONS = (
+    "timestep gravity wind density viscosity integrator cone impratio jacobian solver iterations "
+    "tolerance ls_iterations ls_tolerance noslip_iterations noslip_tolerance o_margin o_solref "
+    "o_solimp o_friction disableflags enableflags disableactuator"
 ).split()
 
 
 def scene_hash(model: mujoco.MjModel) -> str:
-    """Hashes what the dynamics depend on, to six significant digits.
+    """Hashes what the dynamics depend on, the solver included, to six significant digits.
 
     Args:
       model: with or without its visual geoms; both give the same hash.
@@ -284,10 +292,9 @@ def scene_hash(model: mujoco.MjModel) -> str:
     digest = hashlib.sha256()
     collides = np.isin(np.arange(model.ngeom), np.r_[model.pair_geom1, model.pair_geom2])
     parts = [getattr(model, name) for name in _HASHED]
-    parts += [model.geom_size[collides], model.geom_pos[collides], model.geom_quat[collides]]
-    option = model.opt
-    parts += [option.timestep, option.gravity, option.integrator]
-    parts += [option.cone, option.impratio, option.disableflags]
+    geoms = (model.geom_type, model.geom_size, model.geom_pos, model.geom_quat, model.geom_bodyid)
+    parts += [field[collides] for field in geoms]
+    parts += [getattr(model.opt, name) for name in _HASHED_OPTIONS]
     for part in parts:
         digest.update(",".join(f"{x:.6g}" for x in np.ravel(part)).encode() + b";")
     return digest.hexdigest()[:16]
