@@ -79,7 +79,9 @@ class _Trials:
         self.scene, self.config, self.scenarios = scene, config, scenarios
         self.engine = MujocoEngine(scene, count, conditions, threads)
         self.table = action_table(config.task)
-        self.rng = np.random.default_rng(noise_seed)
+        # One generator per scenario: its noise is the same whoever runs or falls beside it. The
+        # last number tells it from the generator that drew the scenario (suites.py).
+        self.rngs = [np.random.default_rng((noise_seed, k, 1)) for k in range(count)]
         self.late = np.zeros(count, bool)
         self.imu_noise = np.zeros((count, 6))
         if conditions is not None:
@@ -105,7 +107,7 @@ class _Trials:
         motion = self.engine.advance(alive, self.scene.ctrl(targets))
         samples = motion.imu
         if self.noisy:
-            noise = self.rng.normal(size=samples.shape)
+            noise = np.stack([self.rngs[k].normal(size=samples.shape[1:]) for k in alive])
             samples = samples + self.imu_noise[alive, None] * noise
         angles = motion.qpos[:, -1][:, self.scene.leg_qpos]
         memory, outcome = decision.outcome(task, robot, memory, samples, motion.tilt, angles)
