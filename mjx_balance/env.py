@@ -14,6 +14,7 @@ from mjx_balance.task import decision, tilt
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names
 from mjx_balance.task.randomization import DRAWS, draw_conditions
+from mjx_balance.task.reward import REWARDS
 from mjx_balance.task.symmetry import Symmetries, symmetries
 
 
@@ -97,7 +98,7 @@ class BalanceEnv(Env):
         obs = decision.observation(task, robot, memory, physics.qpos[self.scene.leg_qpos])
         zero = jnp.float32(0.0)
         metrics = dict.fromkeys(
-            ("tilt_deg", "fall", "reward_level", "reward_toward", "reward_fail"), zero
+            ("tilt_deg", "fall", "diverged", *(f"reward_{name}" for name in REWARDS)), zero
         )
         return State(physics, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
 
@@ -133,8 +134,9 @@ class BalanceEnv(Env):
         memory, outcome = decision.outcome(task, robot, memory, samples, motion.tilt, angles)
         truncated = ~outcome.fell & (info["decision"] + 1 >= task.episode_length)
         metrics = {
-            "tilt_deg": motion.tilt.mean(),
+            "tilt_deg": outcome.tilt.mean(),
             "fall": outcome.fell.astype(jnp.float32),
+            "diverged": outcome.diverged.astype(jnp.float32),
             **{f"reward_{name}": term for name, term in outcome.rewards.items()},
         }
         info = info | {

@@ -16,6 +16,9 @@ from mjx_balance.task.actions import apply_action
 from mjx_balance.task.observation import extend_history, observe
 from mjx_balance.task.reward import failed, reward_terms
 
+ABSURD = 1e4
+"""Size, in rad, rad/s or m/s^2, from which a value of the simulation is no motion any more."""
+
 
 class Memory(NamedTuple):
     """What one decision leaves to the next, besides the state of the physics."""
@@ -47,8 +50,12 @@ class Outcome(NamedTuple):
     """(..., obs_size) the network's next input."""
     rewards: dict[str, Array]
     """(...) by name (`reward_terms`); their sum is the reward."""
+    tilt: Array
+    """(..., sim_steps) body tilt after each step, deg."""
     fell: Array
-    """(...) bool, whether the body tilted too far on the way."""
+    """(...) bool, whether the body tilted too far on the way, or the simulation diverged."""
+    diverged: Array
+    """(...) bool, whether the simulation gave what no robot can do."""
 
 
 def start(task: TaskConfig, robot: Robot, still: Array) -> Memory:
@@ -116,6 +123,9 @@ def outcome(
 ) -> tuple[Memory, Outcome]:
     """Turns what the sensors gave during a decision into observation, reward and failure.
 
+    Where the simulation diverged, the robot has fallen: its tilt counts as `fail_tilt` all
+    along, the IMU holds its last sample, and the legs count as where they were told to be.
+
     Args:
       task: weights, limits, layout.
       robot: its legs.
@@ -127,11 +137,24 @@ def outcome(
     Returns:
       The memory for the next decision, and the outcome.
     """
-    fell = failed(task, tilts).any(axis=-1)
+    xp = samples.__array_namespace__()
+    diverged = _absurd(samples, 2) | _absurd(tilts, 1) | _absurd(angles, 2)
+    told = kinematics.joint_angles(robot, memory.heights)
+    samples = xp.where(diverged[..., None, None], memory.imu[..., -1:, :], samples)
+    tilts = xp.where(diverged[..., None], task.fail_tilt, tilts)
+    angles = xp.where(diverged[..., None, None], told, angles)
+    fell = diverged | failed(task, tilts).any(axis=-1)
     after = tilts.mean(axis=-1) if task.reward_tilt == "mean" else tilts[..., -1]
     rewards = reward_terms(task, memory.tilt, after, fell.astype(after.dtype))
     memory = memory._replace(imu=extend_history(memory.imu, samples), tilt=after)
-    return memory, Outcome(observation(task, robot, memory, angles), rewards, fell)
+    obs = observation(task, robot, memory, angles)
+    return memory, Outcome(obs, rewards, tilts, fell, diverged)
+
+
+def _absurd(values: Array, axes: int) -> Array:
+    """Whether any value over the last `axes` axes is not a number of a sane size."""
+    bad = ~(abs(values) < ABSURD)
+    return bad.reshape(*values.shape[:-axes], -1).any(axis=-1)
 
 
 def observation(task: TaskConfig, robot: Robot, memory: Memory, angles: Array) -> Array:

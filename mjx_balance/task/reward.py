@@ -3,6 +3,9 @@
 from mjx_balance.config import TaskConfig
 from mjx_balance.task import Array
 
+REWARDS = ("level", "toward", "fail")
+"""Names of the rewards."""
+
 
 def failed(task: TaskConfig, tilt: Array) -> Array:
     """True where the body tilts past `fail_tilt`, or is no number at all.
