@@ -87,6 +87,7 @@ class BalanceEnv(Env):
             "scenario": self._scenario(rng),
             "memory": memory,
             "decision": jnp.int32(0),
+            "decisions_left": jnp.int32(task.episode_length),
             "truncation": jnp.float32(0.0),
         }
         if self._randomised:
@@ -101,6 +102,18 @@ class BalanceEnv(Env):
             ("tilt_deg", "fall", "diverged", *(f"reward_{name}" for name in REWARDS)), zero
         )
         return State(physics, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
+
+    def reset_staggered(self, rng: jax.Array) -> State:
+        """`reset`, but with a random part of the episode's time limit already used.
+
+        For the first episodes of a batch, which would otherwise all time out together.
+        """
+        key_reset, key_left = jax.random.split(rng)
+        state = self.reset(key_reset)
+        left = jax.random.randint(key_left, (), 1, self.config.task.episode_length + 1)
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            info=state.info | {"decisions_left": left}
+        )
 
     def step(self, state: State, action: jax.Array) -> State:
         """Takes one decision.
@@ -132,7 +145,7 @@ class BalanceEnv(Env):
             info = info | {"noise_key": key}
         angles = moved.qpos[self.scene.leg_qpos]
         memory, outcome = decision.outcome(task, robot, memory, samples, motion.tilt, angles)
-        truncated = ~outcome.fell & (info["decision"] + 1 >= task.episode_length)
+        truncated = ~outcome.fell & (info["decisions_left"] <= 1)
         metrics = {
             "tilt_deg": outcome.tilt.mean(),
             "fall": outcome.fell.astype(jnp.float32),
@@ -142,6 +155,7 @@ class BalanceEnv(Env):
         info = info | {
             "memory": memory,
             "decision": info["decision"] + 1,
+            "decisions_left": info["decisions_left"] - 1,
             "truncation": truncated.astype(jnp.float32),
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
