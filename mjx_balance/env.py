@@ -9,7 +9,8 @@ from brax.envs.base import Env, State
 
 from mjx_balance.config import ACTION_AXES, Config, RandomizationConfig, check, preset
 from mjx_balance.engines.mjx import Engine, mjx_engine
-from mjx_balance.scene import Scene, load_scene, model_fields
+from mjx_balance.model_fields import model_fields
+from mjx_balance.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names

@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import math
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,7 +13,6 @@ from mjx_balance.robots import Robot, find_robot
 from mjx_balance.task import Array
 from mjx_balance.task.decision import Targets
 from mjx_balance.task.kinematics import joint_angles
-from mjx_balance.task.randomization import Conditions
 
 VISUAL_GROUP = 2
 ROBOT, BOARD = "robot/", "board/"
@@ -218,48 +216,6 @@ def settle(
         leg_trim=trim,
         imu=data.sensordata[imu].copy(),
     )
-
-
-def model_fields(scene: Scene, conditions: Conditions) -> dict[str, Array]:
-    """The model's fields in given circumstances, for `mjx.Model.replace` or `Batch.expand`.
-
-    The payload is a point mass; its products of inertia are left out.
-
-    Args:
-      scene: the nominal model.
-      conditions: of one world or a batch (...).
-
-    Returns:
-      Field name -> (..., *shape of the field).
-    """
-    model, xp = scene.model, conditions.payload.__array_namespace__()
-    trunk = model.body(f"{ROBOT}{scene.robot.trunk}").id
-    load, at = conditions.payload[..., None], conditions.payload_at
-    mass, centre = model.body_mass[trunk], model.body_ipos[trunk]
-    moved = (mass * centre + load * at) / (mass + load)
-    arm = at - centre
-    spread = xp.sum(arm**2, axis=-1, keepdims=True) - arm**2
-    inertia = model.body_inertia[trunk] + mass * load / (mass + load) * spread
-    gain = conditions.gain[..., None]
-    friction = conditions.friction[..., None, None] * np.ones((model.npair, 2))
-    stiffness = model.actuator_gainprm[scene.leg_ctrl.ravel(), 0] * gain
-
-    def put(field: np.ndarray, where: tuple[Any, ...], value: Array) -> Array:
-        base = xp.zeros((*value.shape[: conditions.payload.ndim], *field.shape)) + field
-        if hasattr(base, "at"):  # JAX arrays are immutable
-            return base.at[(..., *where)].set(value)
-        base[(..., *where)] = value
-        return base
-
-    legs = scene.leg_ctrl.ravel()
-    return {
-        "body_mass": put(model.body_mass, (trunk,), (mass + load)[..., 0]),
-        "body_ipos": put(model.body_ipos, (trunk, slice(None)), moved),
-        "body_inertia": put(model.body_inertia, (trunk, slice(None)), inertia),
-        "actuator_gainprm": put(model.actuator_gainprm, (legs, 0), stiffness),
-        "actuator_biasprm": put(model.actuator_biasprm, (legs, 1), -stiffness),
-        "pair_friction": put(model.pair_friction, (slice(None), slice(0, 2)), friction),
-    }
 
 
 _HASHED = (

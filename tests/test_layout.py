@@ -21,6 +21,7 @@ FLOORS = (
     ),
     ("task.decision",),
     ("scene", "suites", "policy", "run_folder"),
+    ("model_fields",),
     tuple("dqn dqn.networks dqn.replay dqn.losses dqn.whitening".split()),
     ("dqn.learner", "engines", "engines.mjx", "engines.mujoco", "controllers"),
     ("env", "evaluation", "render", "display", "checkpoint", "program_cache"),
@@ -32,8 +33,8 @@ FLOORS = (
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
-    "robots config quiet task scene suites policy run_folder controllers evaluation statistics "
-    "render figures report display engines.mujoco".split()
+    "robots config quiet task scene model_fields suites policy run_folder controllers evaluation "
+    "statistics render figures report display engines.mujoco".split()
 )
 JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
 

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from mujoco.batch import Batch
 
-from mjx_balance.scene import Scene, model_fields
+from mjx_balance.model_fields import model_fields
+from mjx_balance.scene import Scene
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.randomization import Conditions
 
