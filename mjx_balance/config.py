@@ -171,16 +171,16 @@ class DQNConfig:
     """Adam step size (paper 3.2)."""
     learning_rate_end_share: float = bounded(1.0, least=0)
     """Share of it that is left at the end of a cosine decay over the run (paper: constant)."""
-    batch_size: int = bounded(512, least=1)
+    batch_size: int = bounded(32, least=1)
     """Transitions per gradient step (chosen)."""
-    replay_ratio: float = bounded(8.0, above=0)
-    """Transitions replayed per new one: batch_size times gradient steps over env steps
-    (chosen)."""
+    replay_ratio: float = bounded(32.0, above=0)
+    """Transitions replayed per new one: batch_size times gradient steps over env steps (a DQN
+    makes one gradient step per decision)."""
     replay_capacity: int = bounded(131_072, least=1)
     """Transitions kept, rounded down to whole batches of num_envs (chosen)."""
     min_replay_size: int = bounded(4_096, least=1)
     """Transitions stored before learning begins (chosen)."""
-    target_update_period: int = bounded(200, least=1)
+    target_update_period: int = bounded(1_000, least=1)
     """Gradient steps between copies into the target network (chosen)."""
     epsilon_start: float = bounded(1.0, least=0, most=1)
     """Share of random actions at first (chosen)."""
@@ -257,6 +257,7 @@ _DQN = DQNConfig(
     batch_size=512,
     replay_ratio=64,
     min_replay_size=2_048,
+    target_update_period=200,
     epsilon_decay_steps=10_000,
     exploration_noise=2,
     hidden_sizes=(64, 64),
@@ -266,7 +267,8 @@ _DQN = DQNConfig(
 )
 
 PRESETS: Mapping[str, Config] = {
-    "paper": Config(preset="paper"),
+    # 64 envs: about what two cores step at the rate at which they learn.
+    "paper": Config(preset="paper", num_envs=64),
     "default": Config(preset="default", task=_TASK, dqn=_DQN),
     # All IMU samples of the last three decisions, as means over 20 ms, and these decisions'
     # commands, under noise of a data sheet, payloads and late actions: what `default` reads off
