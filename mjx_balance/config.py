@@ -355,7 +355,7 @@ def _check_fields(section: Any) -> None:
         value = getattr(section, field.name)
         wanted = _mismatch(value, hints[field.name])
         if wanted:
-            raise ConfigError(f"{field.name} is {_shown(value)}; it must be {wanted}")
+            raise ConfigError(f"{field.name} is {shown(value)}; it must be {wanted}")
         bounds = field.metadata.get("bounds")
         if bounds is None or value is None:
             continue
@@ -365,7 +365,7 @@ def _check_fields(section: Any) -> None:
         for entry in entries:
             broken = _broken_bound(entry, **bounds)
             if broken:
-                raise ConfigError(f"{field.name} is {_shown(value)}; it must be {broken}")
+                raise ConfigError(f"{field.name} is {shown(value)}; it must be {broken}")
 
 
 def _mismatch(value: Any, hint: Any) -> str | None:
@@ -403,8 +403,8 @@ def _broken_bound(
     return None
 
 
-def _shown(value: Any) -> str:
-    """A value in a message; an endless one would only hide the sentence."""
+def shown(value: Any) -> str:
+    """A value in a message, cut short: an endless one would hide the sentence."""
     try:
         text = repr(value)
     except ValueError:  # an int of too many digits
@@ -489,11 +489,11 @@ def from_dict(kind: type[T], values: Mapping[str, Any]) -> T:
       ConfigError: for a field that `kind` does not have, or what is no section at all.
     """
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{kind.__name__} is {_shown(values)}; it must map its fields to values")
+        raise ConfigError(f"{kind.__name__} is {shown(values)}; it must map its fields to values")
     fields = {f.name: f for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]
     unknown = sorted(map(str, set(values) - set(fields)))
     if unknown:
-        raise ConfigError(f"unknown field {_shown(unknown[0])} in {kind.__name__}")
+        raise ConfigError(f"unknown field {shown(unknown[0])} in {kind.__name__}")
     built = {}
     for name, value in values.items():
         section = _SECTIONS.get(name)

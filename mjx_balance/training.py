@@ -284,7 +284,7 @@ def _export(
             "date": time.strftime("%Y-%m-%d"),
         }
         own = dataclasses.replace(config, seed=config.seed + k, num_seeds=1)
-        manifest = make_manifest(own, env.scene.hash, action_factors(config, env), provenance)
+        manifest = make_manifest(own, env.scene.hash, provenance)
         if config.num_seeds > 1:
             folder.seeds.mkdir(exist_ok=True)
             save_policy(folder.seeds / f"seed-{own.seed}.safetensors", mine, manifest)

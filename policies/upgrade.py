@@ -16,9 +16,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from mjx_balance.config import Config, check, from_dict, to_dict
-from mjx_balance.policy import FORMAT_VERSION, Policy, load_policy
-from mjx_balance.robots import find_robot
+from mjx_balance.config import Config, check, from_dict
+from mjx_balance.policy import FORMAT_VERSION, Policy, load_policy, make_manifest
 from mjx_balance.scene import load_scene
 
 SCENE_OF_0_1 = "736718339cc4c03b"
@@ -52,12 +51,10 @@ def upgrade(path: Path) -> None:
     if manifest["version"] != 2 or manifest["scene_hash"] != SCENE_OF_0_1:
         raise SystemExit(f"{path}: not a format-2 policy of the scene of version 0.1")
     config = upgraded_config(manifest["config"])
-    manifest |= {
-        "version": FORMAT_VERSION,
-        "config": to_dict(config),
-        "robot": to_dict(find_robot(config.robot)),
-        "scene_hash": load_scene(config).hash,
-    }
+    for part in ("network", "actions", "rates_hz"):
+        assert make_manifest(config, "", {})[part] == manifest[part], part
+    versions = {"versions": manifest["versions"]}
+    manifest = make_manifest(config, load_scene(config).hash, manifest["training"]) | versions
     before = Policy(manifest, weights).fingerprint
     part = path.with_suffix(".part")
     safetensors.numpy.save_file(weights, part, metadata={"manifest": json.dumps(manifest)})
