@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fleet import walked
 
 from mjx_balance.config import Config, TaskConfig
 from mjx_balance.robots import Robot
@@ -66,15 +67,6 @@ def put(xp: types.ModuleType, tree: Any) -> Any:
 
 def tolerance(xp: types.ModuleType) -> float:
     return 1e-12 if xp is np else 3e-6
-
-
-def walked(targets: np.ndarray, phase: float, rate: float, until: float) -> np.ndarray:
-    """Where a board has walked to, deg, from level, one period after the other."""
-    board, clock = np.zeros(2), until + phase
-    for k, goal in enumerate(targets):
-        spent = clock - 10 * k if k == len(targets) - 1 else min(clock - 10 * k, 10)
-        board = board + np.clip(goal - board, -rate * max(spent, 0), rate * max(spent, 0))
-    return board
 
 
 def obeyed(memory: decision.Memory, change: np.ndarray, late: Any) -> tuple[Any, Any]:
@@ -287,6 +279,23 @@ def test_one_step_beyond_six_degrees_is_a_fall(
     np.testing.assert_allclose(np.asarray(outcome.rewards["fail"]), (0, -0.5, -0.5))
     np.testing.assert_allclose(np.asarray(outcome.tilt), tilts, rtol=1e-6)
     assert not np.asarray(outcome.diverged).any()
+
+
+def test_where_physics_diverged_the_last_sample_is_held(
+    xp: types.ModuleType, task: TaskConfig, robot: Robot
+) -> None:
+    """And the legs count as where they were told to be, which a late robot's command is not."""
+    memory, (samples, tilts, angles) = random_memory(task), readings()
+    samples[1, 49, 2] = np.nan
+    after, outcome = decision.outcome(task, robot, *put(xp, (memory, samples, tilts, angles)))
+    held = np.concatenate((memory.imu[1, 50:], np.tile(memory.imu[1, -1], (50, 1))))
+    np.testing.assert_allclose(np.asarray(after.imu)[1], held, rtol=1e-6)
+    heights = 0.35 + 0.01 * np.asarray(outcome.obs)[1, :4]
+    np.testing.assert_allclose(heights, memory.heights[1], atol=1e-5)
+    np.testing.assert_array_equal(np.asarray(outcome.tilt)[1], np.full(50, 6.0))
+    np.testing.assert_array_equal(np.asarray(outcome.diverged), (False, True, False))
+    np.testing.assert_array_equal(np.asarray(outcome.fell), (False, True, False))
+    assert float(after.tilt[1]) == 6
 
 
 def test_one_robot_is_a_row_of_a_batch(task: TaskConfig, robot: Robot) -> None:
