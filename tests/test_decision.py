@@ -7,6 +7,7 @@ words: legs of two links of 0.213 m, feet of 22 mm, a board that walks at its ra
 import dataclasses
 import math
 import types
+from functools import partial
 from typing import Any
 
 import jax
@@ -256,11 +257,11 @@ def test_rewards_by_hand(
         after = [row[-1] if rewarded == "end" else sum(row) / 50 for row in tilts]
         level = [0.4 * math.exp(-1.5 * x) for x in after]
         toward = [0.8 * max(-1, min(1, (a - b) / 2.5)) for a, b in zip(before, after, strict=True)]
-        close = {"rtol": 1e-4, "atol": 1e-5}
-        np.testing.assert_allclose(np.asarray(outcome.rewards["level"]), level, **close)
-        np.testing.assert_allclose(np.asarray(outcome.rewards["toward"]), toward, **close)
+        close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
+        close(np.asarray(outcome.rewards["level"]), level)
+        close(np.asarray(outcome.rewards["toward"]), toward)
         np.testing.assert_array_equal(np.asarray(outcome.rewards["fail"]), np.zeros(N))
-        np.testing.assert_allclose(np.asarray(memory.tilt), after, **close)
+        close(np.asarray(memory.tilt), after)
         assert set(outcome.rewards) == {"level", "toward", "fail"}
         before = after
 

@@ -60,7 +60,8 @@ def courses(fleet: Fleet, closed_loop: list[Any]) -> tuple[Course, Course]:
     )
     assert not rollout.fell.any()
     theirs = Course(
-        *(np.asarray([getattr(view, name) for view in views]) for name in ("obs", "imu")),
+        np.asarray([view.obs for view in views]),
+        np.asarray([view.imu for view in views]),
         np.asarray(actions),
         np.asarray([view.qpos for view in views]),
         rollout.tilt.reshape(ENVS, EPISODE, -1).mean(axis=-1).T,

@@ -41,7 +41,7 @@ def roll_pitch(fleet: Fleet, states: list[Any]) -> np.ndarray:
 
 def test_starts_settled_and_level(fleet: Fleet, config: Config) -> None:
     for env, size in ((fleet.env, 4 + 8 + 6 + 6), (BalanceEnv(config), 34)):
-        state = env.reset(jax.random.PRNGKey(0))
+        state: Any = env.reset(jax.random.PRNGKey(0))
         assert jnp.shape(state.obs) == (env.observation_size,) == (size,)
         # In units of 1 cm, 1 deg/s and 1 deg: nothing moves, nothing tilts.
         np.testing.assert_allclose(np.asarray(state.obs), 0, atol=0.03)
@@ -146,14 +146,15 @@ def test_a_fall_at_the_time_limit_is_a_fall(fleet: Fleet, pushed: list[Any]) -> 
 def test_boards_go_where_their_scenario_says(fleet: Fleet, closed_loop: list[Any]) -> None:
     """Every env its own way, to the servos' lag of 10 ms, which is 0.035 deg at 3.5 deg/s."""
     scenario = closed_loop[0].info["scenario"]
-    for number, state in enumerate(closed_loop):
-        board = np.degrees(state.pipeline_state.qpos[:, fleet.env.scene.board_qpos])
+    qpos = np.asarray([state.pipeline_state.qpos for state in closed_loop])
+    board = np.degrees(qpos[:, :, fleet.env.scene.board_qpos])
+    for number in range(EPISODE + 1):
         expected = [
             walked(targets, phase, rate, 0.2 * number)
             for targets, phase, rate in zip(*scenario, strict=True)
         ]
-        np.testing.assert_allclose(board, expected, atol=0.06)
-    assert np.ptp(board, axis=0).min() > 5
+        np.testing.assert_allclose(board[number], expected, atol=0.06)
+    assert np.ptp(board[-1], axis=0).min() > 5
 
 
 def test_equal_keys_equal_episodes(fleet: Fleet) -> None:
