@@ -12,13 +12,13 @@ from mjx_balance.config import Config, TaskConfig
 from mjx_balance.evaluation import Controller, Envelope, observing, policy_scene, run_suite
 from mjx_balance.policy import Policy
 from mjx_balance.scene import Scene
+from mjx_balance.suites import SEEDS
 from mjx_balance.task.reward import reward_terms, roll_pitch
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 RECORD_SECONDS = 100.0
-RECORD_SEED = 2_000_000
 BLUE, ORANGE, GREY = "#2166ac", "#d6604d", "#777777"
 SHADES = ("#b2182b", "#ef8a62", "#7f7f7f", "#1a9850", "#91cf60")
 STYLE: dict[Any, Any] = {
@@ -159,7 +159,7 @@ def rollout_figure(
     limit = config.task.max_incline
     for column, (name, controller) in zip(axes.T, controllers.items(), strict=True):
         rollout = run_suite(
-            scene, config, controller, suite, 1, RECORD_SECONDS, RECORD_SEED, record=True
+            scene, config, controller, suite, 1, RECORD_SECONDS, SEEDS.record, record=True
         )
         assert rollout.qpos is not None
         qpos = rollout.qpos[0]

@@ -32,10 +32,8 @@ from mjx_balance.evaluation import (
 from mjx_balance.policy import Policy, PolicyError, load_policy
 from mjx_balance.scene import Scene
 from mjx_balance.statistics import TILTS, over_seeds
+from mjx_balance.suites import HEADLINE, SEEDS
 
-SUITES = ("paper", "corner")
-SEED = 4_000_000
-"""Seed of the report's own scenarios."""
 DURATION = 60.0
 ENVELOPE_SCENARIOS = 2
 ENVELOPE_DURATION = 30.0
@@ -272,7 +270,7 @@ def _measure(
     assert run.policy is not None
     config, file = run.policy.config, run.path / CACHE
     key = [run.policy.fingerprint, scene.hash, baselines_digest()]
-    key += [scenarios, DURATION, SEED, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
+    key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
     try:
         saved = json.loads(file.read_text())
         if saved["key"] == key:
@@ -282,20 +280,26 @@ def _measure(
     data: dict[str, Any] = {"key": key, "results": {}, "histogram": {}}
     for name in ("policy", *CONTROLLERS):
         data["results"][name], data["histogram"][name] = {}, {}
-        for suite in SUITES:
+        for suite in HEADLINE:
             controller = (
                 observing(run.policy) if name == "policy" else make_controller(name, scene, config)
             )
             with progress(f"{name}, suite {suite}") as bar:
                 rollout = run_suite(
-                    scene, config, controller, suite, scenarios, DURATION, SEED, bar
+                    scene, config, controller, suite, scenarios, DURATION, SEEDS.report, bar
                 )
-            data["results"][name][suite] = summarize(rollout, suite, DURATION, SEED)
+            data["results"][name][suite] = summarize(rollout, suite, DURATION, SEEDS.report)
             counts, _ = np.histogram(rollout.tilt, EDGES)
             data["histogram"][name][suite] = (counts / counts.sum()).tolist()
     with progress("envelope") as bar:
         mapped = envelope(
-            scene, config, observing(run.policy), ENVELOPE_SCENARIOS, ENVELOPE_DURATION, SEED, bar
+            scene,
+            config,
+            observing(run.policy),
+            ENVELOPE_SCENARIOS,
+            ENVELOPE_DURATION,
+            SEEDS.report,
+            bar,
         )
     data["envelope"] = dataclasses.asdict(mapped)
     file.write_text(json.dumps(data) + "\n")
@@ -328,7 +332,7 @@ def _summary(policy: Policy, data: dict[str, Any]) -> list[str]:
     rows = []
     for name, suites in results.items():
         cells = [f"<td><b>{name}</b></td><td>{described[name]}</td>"]
-        for suite in SUITES:
+        for suite in HEADLINE:
             result, tilt = suites[suite], suites[suite]["tilt_deg"]
             cells.append(f"<td>{result['falls']}</td>")
             cells += [f"<td>{tilt[key]:.3f}</td>" for key in ("mean", "p95", "max")]
@@ -345,9 +349,9 @@ def _summary(policy: Policy, data: dict[str, Any]) -> list[str]:
         + "<th>falls</th><th>mean</th><th>p95</th><th>max</th>"
         * 2
         + f"</tr></thead><tbody>{''.join(rows)}</tbody></table><p>Plain MuJoCo, {count} held-out "
-        f"scenarios of {DURATION:g} s per suite (seed {SEED}), tilt in degrees over every physics "
-        "step; from a fall on it counts as 6°. All take the same 21 x 21 actions at 5 Hz. The last "
-        "column is the mean height change commanded per decision in the last 3 s of each period. "
+        f"scenarios of {DURATION:g} s per suite (seed {SEEDS.report}), tilt in degrees over every "
+        "physics step; from a fall on it counts as 6°. All take the same 21 x 21 actions at 5 Hz. "
+        "The last column is the mean height change commanded per decision in the last 3 s of each period. "
         "The paper gives no figures; it reports a high peak of the tilt when the board turns on "
         "both axes at once, and that its controller cannot handle that.</p></section>",
     ]
@@ -361,7 +365,7 @@ def _seeds(shown: Run, runs: list[Run]) -> list[str]:
 
     alike = [run for run in runs if run is shown or (run.config and recipe(run) == recipe(shown))]
     each = [result for run in alike for result in run.results]
-    shared = [suite for suite in SUITES if all(suite in result for result in each)]
+    shared = [suite for suite in HEADLINE if all(suite in result for result in each)]
     if len(each) < 2 or not shared:
         return []
     statistics = {suite: over_seeds([result[suite] for result in each]) for suite in shared}
@@ -417,7 +421,7 @@ def _pictures(policy: Policy, scene: Scene, data: dict[str, Any], missing: list[
         _figure("Envelope", figures.envelope_figure(mapped, config.task.fail_tilt), caption)
     )
     rollout = run_suite(
-        scene, config, observing(policy), "corner", 1, VIDEO_SECONDS, SEED, record=True
+        scene, config, observing(policy), "corner", 1, VIDEO_SECONDS, SEEDS.report, record=True
     )
     assert rollout.qpos is not None
     with tempfile.TemporaryDirectory() as folder:
