@@ -30,7 +30,7 @@ from mjx_balance.evaluation import (
     summarize,
 )
 from mjx_balance.policy import Policy
-from mjx_balance.report import ENVELOPE_DURATION, ENVELOPE_SCENARIOS, baselines_digest
+from mjx_balance.report.measuring import ENVELOPE_DURATION, ENVELOPE_SCENARIOS, baselines_digest
 from mjx_balance.statistics import TILTS, over_seeds
 from mjx_balance.suites import HEADLINE, SEEDS, SUITES
 

@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 from tensorboardX import SummaryWriter
 
-from mjx_balance import evaluation, figures, report
+from mjx_balance import evaluation
 from mjx_balance.checkpoint import Checkpoints
 from mjx_balance.config import Config, ConfigError, check, to_dict
 from mjx_balance.display import Display
@@ -26,6 +26,7 @@ from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.env import BalanceEnv
 from mjx_balance.policy import Policy, flat_weights, load_policy, make_manifest, save_policy
 from mjx_balance.program_cache import compile_cached, digest, enable_compilation_cache
+from mjx_balance.report import figures, measuring, tables
 from mjx_balance.run_folder import RunFolder, check_same_config, create_run_folder, read_run_config
 from mjx_balance.statistics import over_seeds
 from mjx_balance.suites import HEADLINE, SEEDS
@@ -175,9 +176,17 @@ def train(
             )
     results = _evaluate(sized, policies, folder, display)
     with display.phase("drawing figures"):
-        figures.draw_figures(folder.path, load_policy(folder.policy))
+        policy = load_policy(folder.policy)
+        lines = [json.loads(text) for text in folder.metrics.read_text().splitlines()]
+        figures.draw_figures(
+            folder.figures,
+            lines,
+            policy.config.task,
+            evaluation.policy_scene(policy),
+            {"policy": measuring.recorded(policy, "paper", measuring.RECORD_SECONDS, SEEDS.record)},
+        )
     folder.evaluation.write_text(json.dumps(results, indent=2) + "\n")
-    report.print_summary(display.console, folder.path, results, time.perf_counter() - began)
+    tables.print_summary(display.console, folder.path, results, time.perf_counter() - began)
     return results
 
 
@@ -357,7 +366,7 @@ def _choose(
     written = {"best": policies[best].config.seed, "statistics": summary, "seeds": rows}
     folder.seeds_summary.write_text(json.dumps(written, indent=2) + "\n")
     display.say(f"best of the {len(policies)} seeds on the validation set: {written['best']}")
-    display.console.print(report.seeds_table(summary))
+    display.console.print(tables.seeds_table(summary))
     return best
 
 

@@ -8,9 +8,9 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 
-from mjx_balance import figures
 from mjx_balance.config import Config
 from mjx_balance.evaluation import Envelope
+from mjx_balance.report import figures
 
 NAMES = (
     "train/tilt_deg",
@@ -64,7 +64,7 @@ def test_learning_curves_show_the_median_and_the_extremes_over_seeds() -> None:
     np.testing.assert_allclose(data(figure.axes[0]), [(1, 2), (2, 4)])
     band = figure.axes[0].collections[0]
     assert isinstance(band, FillBetweenPolyCollection)
-    corners = {tuple(x) for x in np.round(band.get_paths()[0].vertices, 9).tolist()}
+    corners = {tuple(x) for x in np.asarray(band.get_paths()[0].vertices, float).round(9).tolist()}
     assert corners == {(1, 1), (2, 2), (1, 5), (2, 10)}
     np.testing.assert_allclose(data(figure.axes[2])[:, 1], 9, err_msg="not logged by seed")
 
@@ -139,7 +139,7 @@ def test_envelope_figure_has_speed_to_the_right_and_incline_upward() -> None:
     ):
         mesh = next(c for c in axis.collections if isinstance(c, QuadMesh))
         np.testing.assert_allclose(np.asarray(mesh.get_array()).reshape(3, 2), values)
-        corners = mesh.get_coordinates()
+        corners = np.asarray(mesh.get_coordinates(), float)
         centres = (corners[:-1, :-1] + corners[1:, 1:]) / 2
         np.testing.assert_allclose(centres[..., 0], np.tile([2.5, 3.5], (3, 1)))
         np.testing.assert_allclose(centres[..., 1], np.tile([[2.0], [4.0], [6.0]], 2))

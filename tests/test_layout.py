@@ -24,8 +24,11 @@ FLOORS = (
     ),
     ("plant", "dqn.learner"),
     ("physics", "baselines", "evaluation"),
-    ("env", "render", "figures", "display", "checkpoint", "program_cache"),
-    ("report",),
+    ("env", "render", "display", "checkpoint", "program_cache", "report"),
+    ("report.figures", "report.tables"),
+    ("report.reading",),
+    ("report.measuring",),
+    ("report.page",),
     ("training",),
     ("cli",),
     ("__main__",),
@@ -33,7 +36,7 @@ FLOORS = (
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "config quiet task scene suites plant policy run_folder baselines evaluation statistics render "
-    "figures report display".split()
+    "report display".split()
 )
 JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
 
