@@ -30,13 +30,11 @@ from mjx_balance.evaluation import (
     summarize,
 )
 from mjx_balance.policy import Policy
-from mjx_balance.report import ENVELOPE_DURATION, ENVELOPE_SCENARIOS, baselines_digest
+from mjx_balance.report.measuring import ENVELOPE_DURATION, ENVELOPE_SCENARIOS, baselines_digest
 from mjx_balance.statistics import TILTS, over_seeds
-from mjx_balance.suites import SUITES
+from mjx_balance.suites import HEADLINE, SEEDS, SUITES
 
-SEED = 7_000_000
 DURATION = 60.0
-MAIN = ("paper", "corner")
 BOARDS = ("fast", "steep")
 
 
@@ -67,13 +65,15 @@ def suite_result(
 
     def measure(bar: Any) -> dict[str, Any]:
         scene = policy_scene(policy)
-        rollout = run_suite(scene, policy.config, make(), suite, scenarios, DURATION, SEED, bar)
+        rollout = run_suite(
+            scene, policy.config, make(), suite, scenarios, DURATION, SEEDS.held_out, bar
+        )
         firsts = {str(n): float(rollout.tilt[:n].mean()) for n in parts if n <= scenarios}
-        return summarize(rollout, suite, DURATION, SEED) | {"mean_of_first": firsts}
+        return summarize(rollout, suite, DURATION, SEEDS.held_out) | {"mean_of_first": firsts}
 
     ramp = policy.config.task.action_ramp
     key = f"{name}, scene {policy.scene_hash}, ramp {ramp}, {suite}, {scenarios} x {DURATION:g} s"
-    key += f", seed {SEED}"
+    key += f", seed {SEEDS.held_out}"
     return measured(out, key, f"{name}, {suite}, {scenarios} scenarios", measure)
 
 
@@ -121,7 +121,7 @@ def main() -> None:
     baselines: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in CONTROLLERS}
     for suite in SUITES:
         usual = args.rest if suite in BOARDS else args.others
-        count = args.scenarios if suite in MAIN else usual
+        count = args.scenarios if suite in HEADLINE else usual
         networks[suite] = [
             suite_result(
                 args.out,
@@ -149,12 +149,18 @@ def main() -> None:
 
         def measure(bar: Any, policy: Policy = policy) -> dict[str, Any]:
             found = envelope(
-                scene, config, observing(policy), ENVELOPE_SCENARIOS, ENVELOPE_DURATION, SEED, bar
+                scene,
+                config,
+                observing(policy),
+                ENVELOPE_SCENARIOS,
+                ENVELOPE_DURATION,
+                SEEDS.held_out,
+                bar,
             )
             return vars(found)
 
         key = f"envelope of policy {policy.fingerprint}, scene {scene.hash}, "
-        key += f"{ENVELOPE_SCENARIOS} x {ENVELOPE_DURATION:g} s, seed {SEED}"
+        key += f"{ENVELOPE_SCENARIOS} x {ENVELOPE_DURATION:g} s, seed {SEEDS.held_out}"
         shares.append(Envelope(**measured(args.out, key, "envelope", measure)).fall_free_share)
     settled = max(r["action_mm_settled"] for results in networks.values() for r in results)
     note = (

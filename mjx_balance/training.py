@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 from tensorboardX import SummaryWriter
 
-from mjx_balance import evaluation, figures, report
+from mjx_balance import evaluation
 from mjx_balance.checkpoint import Checkpoints
 from mjx_balance.config import Config, ConfigError, check, to_dict
 from mjx_balance.display import Display
@@ -26,8 +26,10 @@ from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.env import BalanceEnv
 from mjx_balance.policy import Policy, flat_weights, load_policy, make_manifest, save_policy
 from mjx_balance.program_cache import compile_cached, digest, enable_compilation_cache
+from mjx_balance.report import figures, measuring, tables
 from mjx_balance.run_folder import RunFolder, check_same_config, create_run_folder, read_run_config
 from mjx_balance.statistics import over_seeds
+from mjx_balance.suites import HEADLINE, SEEDS
 
 STATE_COPIES = 2
 """A checkpoint is read back beside the state that it replaces."""
@@ -37,12 +39,6 @@ CPU_ENVS = 256
 ACCELERATOR_ENVS = 2048
 PER_SEED = ("tilt_deg", "falls_per_minute", "reward", "loss")
 """Metrics that are also logged for every seed, where there are several."""
-EVALUATED = ("paper", "corner")
-"""Suites of the evaluation after training."""
-EVALUATION_SEED = 1_000_000
-"""Seed of the final evaluation's scenarios; training draws from other generators."""
-VALIDATION_SEED = 3_000_000
-"""Seed of the scenarios that choose among several training seeds; never reported."""
 VALIDATION_SCENARIOS = 32
 
 
@@ -177,9 +173,17 @@ def train(
             )
     results = _evaluate(sized, policies, folder, display)
     with display.phase("drawing figures"):
-        figures.draw_figures(folder.path, load_policy(folder.policy))
+        policy = load_policy(folder.policy)
+        lines = [json.loads(text) for text in folder.metrics.read_text().splitlines()]
+        figures.draw_figures(
+            folder.figures,
+            lines,
+            policy.config.task,
+            evaluation.policy_scene(policy),
+            {"policy": measuring.recorded(policy, "paper", measuring.RECORD_SECONDS, SEEDS.record)},
+        )
     folder.evaluation.write_text(json.dumps(results, indent=2) + "\n")
-    report.print_summary(display.console, folder.path, results, time.perf_counter() - began)
+    tables.print_summary(display.console, folder.path, results, time.perf_counter() - began)
     return results
 
 
@@ -301,13 +305,13 @@ def _evaluate(
     each = []
     for policy in policies:
         results = {}
-        for suite in EVALUATED:
+        for suite in HEADLINE:
             title = f"evaluating in plain MuJoCo, suite {suite}"
             if len(policies) > 1:
                 title += f", seed {policy.config.seed}"
             with display.bar(title) as bar:
                 results[suite] = evaluation.evaluate(
-                    policy, suite, config.eval_scenarios, config.eval_duration, EVALUATION_SEED, bar
+                    policy, suite, config.eval_scenarios, config.eval_duration, SEEDS.final, bar
                 )
         each.append(results)
     best = _choose(config, policies, each, folder, display) if len(policies) > 1 else 0
@@ -330,7 +334,7 @@ def _choose(
     scores, rows = [], []
     for policy, results in zip(policies, each, strict=True):
         validated = []
-        for suite in EVALUATED:
+        for suite in HEADLINE:
             with display.bar(f"validating seed {policy.config.seed}, suite {suite}") as bar:
                 validated.append(
                     evaluation.evaluate(
@@ -338,7 +342,7 @@ def _choose(
                         suite,
                         VALIDATION_SCENARIOS,
                         config.eval_duration,
-                        VALIDATION_SEED,
+                        SEEDS.validation,
                         bar,
                     )
                 )
@@ -348,18 +352,18 @@ def _choose(
         rows.append(
             {
                 "seed": policy.config.seed,
-                "validation": dict(zip(EVALUATED, validated, strict=True)),
+                "validation": dict(zip(HEADLINE, validated, strict=True)),
                 "evaluation": results,
             }
         )
     best = scores.index(min(scores))
     chosen = folder.seeds / f"seed-{policies[best].config.seed}.safetensors"
     shutil.copyfile(chosen, folder.policy)
-    summary = {suite: over_seeds([results[suite] for results in each]) for suite in EVALUATED}
+    summary = {suite: over_seeds([results[suite] for results in each]) for suite in HEADLINE}
     written = {"best": policies[best].config.seed, "statistics": summary, "seeds": rows}
     folder.seeds_summary.write_text(json.dumps(written, indent=2) + "\n")
     display.say(f"best of the {len(policies)} seeds on the validation set: {written['best']}")
-    display.console.print(report.seeds_table(summary))
+    display.console.print(tables.seeds_table(summary))
     return best
 
 

@@ -24,9 +24,12 @@ FLOORS = (
     ("model_fields",),
     tuple("dqn dqn.networks dqn.replay dqn.losses dqn.whitening".split()),
     ("dqn.learner", "engines", "engines.mjx", "engines.mujoco", "controllers"),
-    ("env", "evaluation", "render", "display", "checkpoint", "program_cache"),
-    ("figures",),
-    ("report",),
+    ("env", "evaluation"),
+    ("render", "display", "checkpoint", "program_cache", "report"),
+    ("report.figures", "report.tables"),
+    ("report.reading",),
+    ("report.measuring",),
+    ("report.page",),
     ("training",),
     ("cli",),
     ("__main__",),
@@ -34,7 +37,7 @@ FLOORS = (
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "robots config quiet task scene model_fields suites policy run_folder controllers evaluation "
-    "statistics render figures report display engines.mujoco".split()
+    "statistics render report display engines.mujoco".split()
 )
 JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
 

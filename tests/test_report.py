@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mjx_balance import figures, report
 from mjx_balance.cli import main
 from mjx_balance.config import Config, preset, to_dict
 from mjx_balance.policy import make_manifest, save_policy
+from mjx_balance.report import figures, measuring, page, reading, tables
 from mjx_balance.scene import Scene
 
 ISOLATED = '"network_isolation_key":"file://'
@@ -26,6 +26,7 @@ SHORTER = {
     "DURATION": 3.0,
     "ENVELOPE_SCENARIOS": 1,
     "ENVELOPE_DURATION": 1.0,
+    "RECORD_SECONDS": 12.0,
     "VIDEO_SECONDS": 1.0,
 }
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -74,21 +75,21 @@ def run(config: Config, scene: Scene, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture(scope="module")
-def page(run: Path) -> Path:
+def written(run: Path) -> Path:
     """The report on that folder, by the command."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in SHORTER.items():
-            patch.setattr(report, name, value)
+            patch.setattr(measuring, name, value)
         assert main(("report", str(run), "--scenarios", "2")) == 0
     return run / "report.html"
 
 
-def test_everything_is_there(page: Path) -> None:
-    text = page.read_text()
+def test_everything_is_there(written: Path) -> None:
+    text = written.read_text()
     titles = re.findall(r"<h2>(.*?)</h2>", text)
     expected = (
-        "Against the baselines|Over the training seeds|100 s on the board: paper|"
-        "100 s on the board: corner|Tilt distribution|Envelope|Video|Learning curves|"
+        "Against the baselines|Over the training seeds|12 s on the board: paper|"
+        "12 s on the board: corner|Tilt distribution|Envelope|Video|Learning curves|"
         "Reward (Fig. 4 and 5 of the paper)|Config|Reproduce"
     )
     assert titles == expected.split("|"), "nothing is missing"
@@ -101,27 +102,27 @@ def test_everything_is_there(page: Path) -> None:
     assert "data:video/mp4;base64," in text
 
 
-def test_the_page_needs_nothing_from_elsewhere(page: Path) -> None:
-    text = re.sub(r'"data:[^"]*"', '""', page.read_text())
+def test_the_page_needs_nothing_from_elsewhere(written: Path) -> None:
+    text = re.sub(r'"data:[^"]*"', '""', written.read_text())
     assert not re.findall(r"(?:src|href)=\"[^\"]+\"", text)
     assert "http" not in text
     assert "<script" not in text
 
 
 def test_measurements_are_kept_and_read_back(
-    run: Path, page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = json.loads((run / "report.json").read_text())
     for suites in data["results"].values():
         assert {r["scenarios"] for r in suites.values()} == {2}
-    for suites in data["histogram"].values():
+    for suites in data["shares"].values():
         for share in suites.values():
             assert sum(share) == pytest.approx(1.0)
     shutil.copy(run / "policy.safetensors", tmp_path)
     data["results"]["pd-imu"]["corner"]["tilt_deg"]["p95"] = 0.424
     (tmp_path / "report.json").write_text(json.dumps(data))
     for name, value in SHORTER.items():
-        monkeypatch.setattr(report, name, value)
+        monkeypatch.setattr(measuring, name, value)
     assert main(("report", str(tmp_path), "--scenarios", "2")) == 0
     assert "<td>0.424</td>" in (tmp_path / "report.html").read_text()
 
@@ -167,7 +168,7 @@ def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_read(
 ) -> None:
     (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
     (tmp_path / name).write_text(content)
-    run = report.read_run(tmp_path)
+    run = reading.read_run(tmp_path)
     assert said in "\n".join(run.missing)
     assert run.metrics == [metrics_line(0, 1)]
 
@@ -175,7 +176,7 @@ def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_read(
 def test_metrics_without_a_line_are_said(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text("{}")
     (tmp_path / "metrics.jsonl").write_text("")
-    said = "\n".join(report.read_run(tmp_path).missing)
+    said = "\n".join(reading.read_run(tmp_path).missing)
     assert "metrics.jsonl cannot be used: it holds no line yet" in said
 
 
@@ -200,7 +201,7 @@ def test_runs_that_log_at_other_intervals_share_one_axis() -> None:
 def test_the_command_gives_every_field_that_the_preset_does_not() -> None:
     best = preset("best")
     dqn = dataclasses.replace(best.dqn, gamma=0.77, mirror=False, hidden_sizes=(8, 9))
-    command = report._train_command(dataclasses.replace(best, dqn=dqn, num_envs=64))
+    command = page.train_command(dataclasses.replace(best, dqn=dqn, num_envs=64))
     assert command == (
         "mjx-balance train --preset best --seed 0 --num-envs 64 --gamma 0.77 --hidden-sizes 8 9 "
         "--no-mirror"
@@ -212,9 +213,9 @@ def test_tables_fit_an_80_column_terminal() -> None:
     row = {"seeds": 5, "falls": 1280, "mean": spread, "p95": spread, "max": spread}
     out = io.StringIO()
     console = Console(width=80, file=out)
-    console.print(report.seeds_table({"friction": row}))
+    console.print(tables.seeds_table({"friction": row}))
     result = evaluation_result("friction", 0.1) | {"scenarios": 100_000, "duration_s": 60.0}
-    console.print(report.evaluation_table({"friction": result | {"action_mm_mean": 0.2}}))
+    console.print(tables.evaluation_table({"friction": result | {"action_mm_mean": 0.2}}))
     text = out.getvalue()
     assert text.count("0.068 (0.068-1.069)") == 3
     assert "100000 x 60 s" in text
@@ -251,11 +252,11 @@ def browse(browser: str, page: str, folder: Path) -> tuple[str, set[str], Path]:
 
 
 @pytest.mark.browser
-def test_a_browser_shows_it_without_errors_or_requests(page: Path, tmp_path: Path) -> None:
+def test_a_browser_shows_it_without_errors_or_requests(written: Path, tmp_path: Path) -> None:
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         pytest.skip("no Chromium on this machine; Debian's package is chromium")
-    said, asked, shot = browse(browser, page.as_uri(), tmp_path)
+    said, asked, shot = browse(browser, written.as_uri(), tmp_path)
     assert "CONSOLE" not in said, said
     assert not asked
     picture = np.asarray(imageio.imread(shot))

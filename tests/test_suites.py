@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import Config, greatest_incline
-from mjx_balance.suites import SUITES, authority, make_scenarios
+from mjx_balance.suites import HEADLINE, SEEDS, SUITES, authority, make_scenarios
 
 
 def test_scenarios_depend_on_the_seed_and_not_on_their_number(config: Config) -> None:
@@ -78,3 +78,10 @@ def test_every_suite_follows_the_configs_incline(config: Config) -> None:
     for name, suite in SUITES.items():
         if not suite.steep:
             assert np.abs(make_scenarios(flat, name, 20, 60, 0)[0].targets).max() <= 2.0
+
+
+def test_no_two_purposes_share_a_seed() -> None:
+    """What chose or tuned something must not also measure it."""
+    seeds = list(dataclasses.asdict(SEEDS).values())
+    assert len(set(seeds)) == len(seeds)
+    assert set(HEADLINE) <= set(SUITES)
