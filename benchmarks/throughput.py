@@ -34,16 +34,16 @@ def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
     with quiet_imports():
         import jax
 
-        from mjx_balance import training
         from mjx_balance.env import BalanceEnv
+        from mjx_balance.training import devices
     from mjx_balance.config import preset
 
     config = dataclasses.replace(preset(preset_name), num_envs=num_envs)
-    training.configure_jax()
+    devices.configure_jax()
     jax.config.update("jax_enable_compilation_cache", False)  # to time the compilation
-    config = training.size_to_device(config)
+    config = devices.size_to_device(config)
     env = BalanceEnv(config)
-    learner = training.make_learner(config, env)
+    learner = devices.make_learner(config, env)
     iterations = max(1, DECISIONS_PER_CALL // num_envs)
     decisions = iterations * num_envs
 

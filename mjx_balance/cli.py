@@ -96,8 +96,8 @@ def _train(argv: list[str]) -> int:
 
     with quiet_imports():
         from mjx_balance import training
-    from mjx_balance.checkpoint import CheckpointError
     from mjx_balance.display import Display
+    from mjx_balance.training.checkpoints import CheckpointError
 
     display = Display()
     try:

@@ -9,12 +9,12 @@ import numpy as np
 import probes
 import pytest
 
-from mjx_balance.checkpoint import CheckpointError, Checkpoints
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import whitening
 from mjx_balance.dqn.learner import Learner, TrainState, dither, epsilon, mirrored
 from mjx_balance.dqn.networks import QNetwork, fold_inputs
 from mjx_balance.dqn.replay import Transition
+from mjx_balance.training.checkpoints import CheckpointError, Checkpoints
 
 CONFIG = DQNConfig(
     gamma=0.5,
