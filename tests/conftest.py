@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import Config, preset
+from mjx_balance.config import RobotConfig as Robot
 from mjx_balance.scene import Scene, load_scene
 
 jax.config.update("jax_num_cpu_devices", 2)
@@ -17,6 +18,12 @@ jax.config.update("jax_num_cpu_devices", 2)
 def config() -> Config:
     """The preset `default`."""
     return preset("default")
+
+
+@pytest.fixture(scope="session")
+def robot(config: Config) -> Robot:
+    """The robot's numbers."""
+    return config.robot
 
 
 @pytest.fixture(scope="session")
