@@ -69,7 +69,7 @@ def run(config: Config, scene: Scene, tmp_path_factory: pytest.TempPathFactory) 
         for name, a, b in (("hidden_0", 34, 64), ("hidden_1", 64, 64), ("head", 98, 3))
     }
     layers |= {"profile": np.zeros(4), "stretch": np.zeros(2)}
-    manifest = make_manifest(config, scene.hash, (21, 21), {})
+    manifest = make_manifest(config, scene.hash, {})
     save_policy(folder / "policy.safetensors", {"params": layers}, manifest)
     return folder
 
