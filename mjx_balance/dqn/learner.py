@@ -182,7 +182,7 @@ class Learner:
     def init(self, seed: int) -> TrainState:
         """Builds the state of a new run, or of runs `seed`, `seed + 1`, ..., on its devices."""
         program = jax.shard_map(
-            self._each_seed(self._init),
+            self._each_seed(self.initial),
             mesh=self.mesh,
             in_specs=REPLICATED,
             out_specs=self.specs,
@@ -219,7 +219,7 @@ class Learner:
             donate_argnums=0,
         )
 
-    def _init(self, key: jax.Array) -> TrainState:
+    def initial(self, key: jax.Array) -> TrainState:
         key, key_params, key_env = jax.random.split(key, 3)
         local_envs = self.num_envs // self.num_devices
         env_state = self._reset(self._device_key(key_env), local_envs)
