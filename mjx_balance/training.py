@@ -106,6 +106,8 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
         config.num_env_steps,
         jax.devices()[: config.num_devices],
         config.num_seeds,
+        env.symmetries if config.dqn.mirror else None,
+        env.action_factors,
     )
 
 

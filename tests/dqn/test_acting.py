@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import DQNConfig
-from mjx_balance.dqn.learner import dither, epsilon, epsilon_greedy
+from mjx_balance.dqn.acting import epsilon, epsilon_greedy, exploration_noise
 
 KEYS = jax.random.split(jax.random.PRNGKey(0), 20_000)
 
@@ -42,7 +42,9 @@ def test_every_action_is_as_likely_as_epsilon_greedy_says(rate: float) -> None:
 
 def test_noise_moves_each_digit_by_up_to_its_levels_all_equally_often() -> None:
     """Action 4 * 7 + 3 of (9, 7) is (4, 3); two levels either way are 25 neighbours."""
-    drawn = np.asarray(jax.vmap(lambda k: dither(k, jnp.int32(4 * 7 + 3), (9, 7), 2))(KEYS))
+    drawn = np.asarray(
+        jax.vmap(lambda k: exploration_noise(k, jnp.int32(4 * 7 + 3), (9, 7), 2))(KEYS)
+    )
     x, y = np.divmod(drawn, 7)
     counts = np.zeros((9, 7))
     np.add.at(counts, (x, y), 1)
@@ -53,7 +55,7 @@ def test_noise_moves_each_digit_by_up_to_its_levels_all_equally_often() -> None:
 
 def test_noise_stops_at_the_ends() -> None:
     """From the corner (0, 6) half the moves lead out of the grid: they end on its edge."""
-    corner = np.asarray(jax.vmap(lambda k: dither(k, jnp.int32(6), (9, 7), 1))(KEYS))
+    corner = np.asarray(jax.vmap(lambda k: exploration_noise(k, jnp.int32(6), (9, 7), 1))(KEYS))
     shares = np.bincount(corner, minlength=63) / len(KEYS)
     expected = np.zeros((9, 7))
     expected[:2, 5:] = np.outer((2, 1), (1, 2)) / 9
@@ -61,4 +63,4 @@ def test_noise_stops_at_the_ends() -> None:
 
 
 def test_noise_keeps_the_actions_type() -> None:
-    assert dither(KEYS[0], jnp.int32(3), (4,), 1).dtype == jnp.int32
+    assert exploration_noise(KEYS[0], jnp.int32(3), (4,), 1).dtype == jnp.int32

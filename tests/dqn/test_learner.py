@@ -38,7 +38,9 @@ def make(
 ) -> Learner:
     config = dataclasses.replace(CONFIG, **changes)
     network = QNetwork(config.hidden_sizes, (2,), config.head == "radial")
-    return Learner(env, network, config, num_envs, num_envs * ITERATIONS, devices, num_seeds)
+    symmetries = probes.PositiveState.symmetries if config.mirror else None
+    total = num_envs * ITERATIONS
+    return Learner(env, network, config, num_envs, total, devices, num_seeds, symmetries)
 
 
 def trained(learner: Learner, seed: int = 0) -> TrainState:
@@ -87,6 +89,7 @@ def test_bootstraps_from_the_target_network_alone(double: bool) -> None:
     DQN lets the online network choose action 1, whose first-drawn value counts.
     """
     changes: dict[str, Any] = {"target_update_period": 10**6, "gamma": 1.0, "epsilon_end": 1.0}
+    changes |= {"learning_rate": 0.02}
     learner = make(probes.Fork(), double=double, **changes)
     start = learner.init(2)
     drawn = np.array(learner.network.apply(start.params, jnp.full(1, 2.0)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_balance.dqn import whitening
-from mjx_balance.dqn.networks import QNetwork, fold_inputs
+from mjx_balance.dqn.networks import QNetwork
 
 
 def gathered(batches: list[np.ndarray]) -> whitening.InputStatistics:
@@ -67,7 +67,7 @@ def test_whitened_observations_are_uncorrelated_and_of_equal_size() -> None:
     np.testing.assert_allclose(np.cov(white.T), np.eye(3), atol=0.15)
 
 
-@pytest.mark.parametrize("hidden", [(8, 6), (8,)])
+@pytest.mark.parametrize("hidden", [(8, 6), (8,), ()])
 @pytest.mark.parametrize("radial", [False, True])
 def test_folded_parameters_take_raw_observations(radial: bool, hidden: tuple[int, ...]) -> None:
     rng = np.random.default_rng(0)
@@ -78,7 +78,7 @@ def test_folded_parameters_take_raw_observations(radial: bool, hidden: tuple[int
     matrix = jnp.asarray(rng.normal(size=(5, 5)), jnp.float32)
     obs = jnp.asarray(rng.normal(size=(20, 5)), jnp.float32)
     expected = network.apply(params, (obs - mean) @ matrix)
-    folded = fold_inputs(params, mean, matrix)
+    folded = network.folded(params, mean, matrix)
     np.testing.assert_allclose(
         np.asarray(network.apply(folded, obs)), np.asarray(expected), rtol=2e-4, atol=2e-4
     )
