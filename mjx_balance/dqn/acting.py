@@ -57,7 +57,6 @@ def explore(
       factors: sizes of the action index' digits.
       levels: of noise; 0 for none.
     """
+    key, key_noise = jax.random.split(key)
     action = epsilon_greedy(key, q_values, rate)
-    if levels:
-        action = exploration_noise(jax.random.fold_in(key, 1), action, factors, levels)
-    return action
+    return exploration_noise(key_noise, action, factors, levels) if levels else action

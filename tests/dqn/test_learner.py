@@ -10,10 +10,12 @@ import numpy as np
 import probes
 import pytest
 from brax.envs.base import Env
+from jax.experimental.key_reuse import _core as key_reuse
 
 from mjx_balance.checkpoint import CheckpointError, Checkpoints
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import replay
+from mjx_balance.dqn.devices import AXIS
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.dqn.networks import QNetwork
 
@@ -125,6 +127,26 @@ def test_every_env_device_and_update_draws_by_itself() -> None:
     by_env = actions.transpose(0, 2, 1).reshape(64, 8)
     assert len(np.unique(by_env, axis=0)) > 50
     assert 0.4 < actions.mean() < 0.6
+
+
+def test_no_key_is_used_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """JAX's own check, on everything that draws in a run."""
+    changes = {"dither": 1, "whiten_steps": 100, "mirror": True}
+    learner = make(probes.PositiveState(), devices=jax.devices()[:1], **changes)
+
+    def check(function: Any, argument: Any) -> Any:
+        trace = jax.make_jaxpr(function, axis_env=[(AXIS, 1)], return_shape=True)
+        program, shapes = trace(argument)
+        key_reuse.check_key_reuse_jaxpr(program.jaxpr)
+        return shapes
+
+    state = check(learner.initial, jax.random.key(0))
+    # JAX lets a key be folded again and again; fold_in(k, 1) is split(k)[1] all the same.
+    once = key_reuse.KeyReuseSignature(key_reuse.Sink(0), key_reuse.Source(0))
+    signatures = key_reuse.key_reuse_signatures
+    fold_in = next(primitive for primitive in signatures if primitive.name == "random_fold_in")
+    monkeypatch.setitem(signatures, fold_in, once)
+    check(learner.iteration, state)
 
 
 def test_traced_once_for_many_calls(noisy: tuple[Learner, Any, Any]) -> None:
