@@ -88,13 +88,17 @@ def _random_program(learner, iterations: int) -> Callable[..., Any]:
     import jax
     import jax.numpy as jnp
 
-    from mjx_balance.dqn.learner import AXIS, REPLICATED
+    from mjx_balance.dqn.collecting import reset_done
+    from mjx_balance.dqn.devices import device_key
+    from mjx_balance.dqn.learner import REPLICATED
+
+    env = learner.env
 
     def step(state, key):
-        key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
+        key = device_key(key)
         count = state.reward.shape[0]
-        action = jax.random.randint(key, (count,), 0, learner.env.action_size)
-        return learner.reset_done(jax.vmap(learner.env.step)(state, action), key), None
+        action = jax.random.randint(key, (count,), 0, env.action_size)
+        return reset_done(env.reset, jax.vmap(env.step)(state, action), key), None
 
     def program(state, key):
         state, _ = jax.lax.scan(step, state, jax.random.split(key, iterations))

@@ -75,6 +75,8 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
         config.num_env_steps,
         jax.devices()[: config.num_devices],
         config.num_seeds,
+        env.symmetries,
+        env.action_factors,
     )
 
 
