@@ -77,6 +77,7 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
         config.num_seeds,
         env.symmetries,
         env.action_factors,
+        env.reset_staggered,
     )
 
 
