@@ -66,7 +66,7 @@ def measured(
         saved = json.loads(file.read_text())
         if saved["key"] == key:
             return Measured(saved["results"], saved["shares"], Envelope(**saved["envelope"]))
-    except (*FOREIGN, OSError):
+    except FOREIGN:
         pass
     found = _measure(policy, scene, scenarios, progress)
     file.write_text(json.dumps({"key": key, **dataclasses.asdict(found)}) + "\n")
