@@ -1,6 +1,7 @@
 """The HTML report: complete, honest about what is missing, and quiet in a browser."""
 
 import base64
+import copy
 import dataclasses
 import html
 import json
@@ -19,7 +20,7 @@ from mjx_balance.cli import main
 from mjx_balance.config import Config, preset, to_dict
 from mjx_balance.evaluation import Envelope
 from mjx_balance.policy import Policy, load_policy, make_manifest, save_policy
-from mjx_balance.report import figures, measuring, page
+from mjx_balance.report import figures, measuring, page, reading
 from mjx_balance.report.measuring import Measured
 from mjx_balance.report.reading import Run
 from mjx_balance.scene import Scene
@@ -345,6 +346,80 @@ def test_the_command_gives_every_field_that_the_preset_does_not() -> None:
         "mjx-balance train --preset best --seed 0 --num-envs 64 --gamma 0.77 --hidden-sizes 8 9 "
         "--no-mirror"
     )
+
+
+HOSTILE = "\"'><img src=x onerror=alert(1)><script>alert(2)</script>{{ 7 * 7 }}"
+
+
+def test_nothing_that_the_template_is_given_becomes_html() -> None:
+    rows = [(HOSTILE, HOSTILE, [HOSTILE])]
+    pair = [(HOSTILE, HOSTILE)]
+    picture = page.Picture(HOSTILE, HOSTILE, HOSTILE)
+    text = page.render_page(
+        {
+            "title": HOSTILE,
+            "missing": [HOSTILE],
+            "comparison": {"tiles": pair, "suites": [HOSTILE], "rows": rows, "note": HOSTILE},
+            "seeds": {"names": [HOSTILE], "rows": [(HOSTILE, [HOSTILE])]},
+            "pictures": [picture],
+            "video": HOSTILE,
+            "video_note": HOSTILE,
+            "training": [picture],
+            "config": {"differs": [(HOSTILE, HOSTILE, HOSTILE)], "everything": HOSTILE},
+            "commands": [HOSTILE],
+            "versions": HOSTILE,
+        }
+    )
+    assert text.count("&lt;script&gt;alert(2)") == 29, "every value is there, as text"
+    assert "<script" not in text
+    assert "<img src=x" not in text
+    assert "49" not in re.sub(r"#\w+", "", text), "nor a template"
+    assert "\"'>" not in text, "nor ends an attribute"
+
+
+def test_a_hostile_run_folder_injects_nothing(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Text in every field that is read, of every file, and in the folder's own name."""
+    folder = tmp_path / "<img src=x onerror=alert(1)>"
+    folder.mkdir()
+    results = {
+        HOSTILE: evaluation_result(HOSTILE, 0.1) | {"note": HOSTILE},
+        "paper": evaluation_result("paper", 0.1) | {"falls": HOSTILE},
+    }
+    (folder / "evaluation.json").write_text(json.dumps(results))
+    (folder / "seeds.json").write_text(json.dumps({"seeds": [{"evaluation": results}] * 2}))
+    lines = [metrics_line(0, 1), metrics_line(1, 1) | {"train/loss": HOSTILE}]
+    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    (folder / "config.json").write_text(json.dumps(to_dict(preset("default")) | {HOSTILE: 1}))
+    (folder / "report.json").write_text(json.dumps({"key": HOSTILE, "results": results}))
+    policy = load_policy(run / "policy.safetensors")
+    manifest = policy.manifest | {"versions": {HOSTILE: HOSTILE, "\ud800": "\ud800"}}
+    (folder / "policy.safetensors").write_text("not used")
+    monkeypatch.setattr(reading, "load_policy", lambda path: hostile)
+    hostile = copy.copy(policy)
+    hostile.manifest = manifest
+    monkeypatch.setattr(measuring, "measured", lambda *given: made_up(policy))
+    monkeypatch.setattr(page, "policy_pictures", lambda *given: [])
+    monkeypatch.setattr(page, "video", lambda *given: "")
+    assert main(("report", str(folder))) == 0
+    text = (folder / "report.html").read_text()
+    assert "<script" not in text
+    assert "<img src=x" not in text
+    assert "&lt;img src=x onerror=alert(1)&gt;" in text
+    said = capsys.readouterr().err
+    for name in ("config.json", "evaluation.json", "seeds.json"):
+        assert f"{folder / name} cannot be used" in said
+    assert "metrics.jsonl is shown up to line 2" in said
+
+
+def test_a_policy_that_does_not_say_its_versions_is_shown(run: Path) -> None:
+    policy = copy.copy(load_policy(run / "policy.safetensors"))
+    policy.manifest = {"versions": {"mujoco": "3.17.0", "jax": None, "numpy": "2"}}
+    assert page.versions(policy) == "mujoco 3.17.0, numpy 2"
+    for versions in ({}, {"versions": None}, {"versions": ["mujoco"]}):
+        policy.manifest = versions
+        assert page.versions(policy) == ""
 
 
 def test_a_foreign_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

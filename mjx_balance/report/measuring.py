@@ -1,5 +1,6 @@
 """Policy and baselines on scenarios: everything that a report has to simulate."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -22,7 +23,16 @@ from mjx_balance.evaluation import (
     summarize,
 )
 from mjx_balance.policy import Policy
-from mjx_balance.report.reading import FOREIGN
+from mjx_balance.report.reading import (
+    FOREIGN,
+    ReportError,
+    count,
+    number,
+    read_json,
+    section,
+    series,
+    suite_result,
+)
 from mjx_balance.scene import Scene
 from mjx_balance.suites import HEADLINE, SEEDS
 
@@ -41,7 +51,7 @@ class Measured:
     """A policy beside the baselines, on the same scenarios."""
 
     results: dict[str, dict[str, dict[str, Any]]]
-    """Controller -> suite -> JSON of `evaluation.summarize`."""
+    """Controller -> suite -> `reading.suite_result`."""
     shares: dict[str, dict[str, list[float]]]
     """Controller -> suite -> share of the physics steps per bin of tilt between `EDGES`."""
     envelope: Envelope
@@ -62,14 +72,62 @@ def measured(
     """
     key = [policy.fingerprint, scene.hash, baselines_digest()]
     key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
-    try:
-        saved = json.loads(file.read_text())
+    with contextlib.suppress(*FOREIGN):  # whatever else lies there, it is measured again
+        saved = read_json(file)
         if saved["key"] == key:
-            return Measured(saved["results"], saved["shares"], Envelope(**saved["envelope"]))
-    except FOREIGN:
-        pass
+            return kept(saved)
     found = _measure(policy, scene, scenarios, progress)
-    file.write_text(json.dumps({"key": key, **dataclasses.asdict(found)}) + "\n")
+    with contextlib.suppress(OSError):  # a folder that cannot be written keeps nothing
+        file.write_text(json.dumps({"key": key, **dataclasses.asdict(found)}) + "\n")
+    return found
+
+
+def kept(saved: dict[str, Any]) -> Measured:
+    """Checks what was read back, value by value.
+
+    Raises:
+      ReportError: for a value that was not measured.
+      KeyError: for one that is missing.
+    """
+    names = ("policy", *CONTROLLERS)
+    mapped = section(saved["envelope"])
+    inclines, rates = (_numbers(mapped[name], None) for name in ("inclines", "rates"))
+    return Measured(
+        results={
+            name: {suite: suite_result(saved["results"][name][suite], suite) for suite in HEADLINE}
+            for name in names
+        },
+        shares={
+            name: {
+                suite: _numbers(saved["shares"][name][suite], len(EDGES) - 1) for suite in HEADLINE
+            }
+            for name in names
+        },
+        envelope=Envelope(
+            inclines=inclines,
+            rates=rates,
+            fall_rate=_grid(mapped["fall_rate"], len(inclines), len(rates)),
+            mean_tilt=_grid(mapped["mean_tilt"], len(inclines), len(rates)),
+            authority=number(mapped["authority"], "authority"),
+            reach=number(mapped["reach"], "reach"),
+            scenarios=count(mapped["scenarios"], "scenarios"),
+            duration_s=number(mapped["duration_s"], "duration_s"),
+            seed=count(mapped["seed"], "seed"),
+        ),
+    )
+
+
+def _numbers(values: Any, size: int | None) -> list[float]:
+    found = [number(value, "a value") for value in series(values, "a row")]
+    if len(found) != (len(found) if size is None else size):
+        raise ReportError(f"a row holds {len(found)} values, not {size}")
+    return found
+
+
+def _grid(values: Any, rows: int, columns: int) -> list[list[float]]:
+    found = [_numbers(row, columns) for row in series(values, "a grid")]
+    if len(found) != rows:
+        raise ReportError(f"a grid holds {len(found)} rows, not {rows}")
     return found
 
 
@@ -86,7 +144,8 @@ def _measure(
                 rollout = run_suite(
                     scene, policy.config, controller, suite, scenarios, DURATION, SEEDS.report, bar
                 )
-            results[name][suite] = summarize(rollout, suite, DURATION, SEEDS.report)
+            summary = summarize(rollout, suite, DURATION, SEEDS.report)
+            results[name][suite] = suite_result(summary, suite)
             counts, _ = np.histogram(rollout.tilt, EDGES)
             shares[name][suite] = (counts / counts.sum()).tolist()
     with progress("envelope") as bar:
