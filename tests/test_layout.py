@@ -25,7 +25,7 @@ FLOORS = (
     ("plant", "dqn.learner"),
     ("physics", "baselines", "evaluation"),
     ("env", "render", "display", "checkpoint", "program_cache", "report"),
-    ("report.figures", "report.tables"),
+    ("report.figures", "report.tables", "report.digest"),
     ("report.reading",),
     ("report.measuring",),
     ("report.page",),

@@ -196,6 +196,20 @@ def test_a_folder_that_cannot_be_written_is_measured_all_the_same(
     assert list(found.results) == list(NAMES)
 
 
+def test_with_other_code_everything_is_measured_again(
+    policy: Policy,
+    its_scene: Scene,
+    calls: list[tuple],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = tmp_path / "report.json"
+    measured(policy, its_scene, file, 5, no_bar)
+    monkeypatch.setattr(measuring, "code_digest", lambda: "other")
+    measured(policy, its_scene, file, 5, no_bar)
+    assert len(calls) == 2 * 13
+
+
 def weights_of(path: Path, by: float) -> dict[str, np.ndarray]:
     import safetensors.numpy
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from mjx_balance import baselines
 from mjx_balance.baselines import CONTROLLERS, make_controller
 from mjx_balance.evaluation import (
     Controller,
@@ -23,6 +21,7 @@ from mjx_balance.evaluation import (
     summarize,
 )
 from mjx_balance.policy import Policy
+from mjx_balance.report.digest import code_digest
 from mjx_balance.report.reading import (
     FOREIGN,
     ReportError,
@@ -70,7 +69,7 @@ def measured(
       scenarios: per suite and controller.
       progress: title -> context manager that gives a callable taking the share done.
     """
-    key = [policy.fingerprint, scene.hash, baselines_digest()]
+    key = [policy.fingerprint, scene.hash, code_digest()]
     key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
     with contextlib.suppress(*FOREIGN):  # whatever else lies there, it is measured again
         saved = read_json(file)
@@ -187,8 +186,3 @@ def recorded(
 
 def _controller(name: str, policy: Policy, scene: Scene) -> Controller:
     return observing(policy) if name == "policy" else make_controller(name, scene, policy.config)
-
-
-def baselines_digest() -> str:
-    """Digest of the baselines' source: with it, what was measured of them holds."""
-    return hashlib.sha256(Path(baselines.__file__).read_bytes()).hexdigest()[:8]
