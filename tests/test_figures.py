@@ -1,16 +1,20 @@
 """What a reader of the figures reads: values, axes, units and labels, from the drawn artists."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
+from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config
-from mjx_balance.evaluation import Envelope
+from mjx_balance.evaluation import Envelope, Rollout
 from mjx_balance.report import figures
+from mjx_balance.scene import Scene
 
 NAMES = (
     "train/tilt_deg",
@@ -150,6 +154,79 @@ def test_envelope_figure_has_speed_to_the_right_and_incline_upward() -> None:
         assert title in (axis.get_title(), axis.get_title(loc="left"))
         assert axis.get_xlabel() == "board speed on each axis [deg/s]"
     assert falls.get_ylabel() == "board angle on both axes at once [deg]"
+
+
+def made_up_rollout(
+    config: Config, scene: Scene, fell_at: int, level: float = 0.0
+) -> tuple[Rollout, dict[str, np.ndarray]]:
+    """22 s of a board and a body whose four angles, in deg, are all different."""
+    steps = 5_500
+    time = 0.004 * np.arange(1, steps + 1)
+    angles = {
+        "board X": 4 * np.sin(time) + level,
+        "board Y": 2 * np.cos(time / 3),
+        "body roll": np.sin(5 * time) + 0.5,
+        "body pitch": 0.3 * np.cos(7 * time) - 1,
+    }
+    turned = Rotation.from_euler(
+        "ZYX",
+        np.stack((np.full(steps, 33.0), angles["body pitch"], angles["body roll"]), axis=-1),
+        degrees=True,
+    )
+    qpos = np.tile(scene.stance.qpos, (1, steps, 1))
+    qpos[0][:, scene.board_qpos[0]] = np.radians(angles["board X"])
+    qpos[0][:, scene.board_qpos[1]] = np.radians(angles["board Y"])
+    qpos[0][:, scene.trunk_quat] = turned.as_quat(scalar_first=True)
+    tilt = np.full((1, steps), 0.25)
+    tilt[0, :1_100] = 1.0
+    rollout = Rollout(
+        config=config,
+        tilt=tilt,
+        fell_at=np.array([fell_at]),
+        action_mm=np.zeros((1, 110)),
+        qpos=qpos,
+        seconds=1.0,
+    )
+    return rollout, {"time": time} | angles
+
+
+def test_rollout_figure_shows_each_angle_in_its_row(config: Config, scene: Scene) -> None:
+    standing, angles = made_up_rollout(config, scene, fell_at=5_500)
+    fallen, others = made_up_rollout(config, scene, fell_at=5_499, level=1.5)
+    figure = figures.rollout_figure(scene, {"policy": standing, "none": fallen})
+    axes = np.asarray(figure.axes).reshape(4, 2)
+    for row, name in enumerate(("board X", "board Y", "body roll", "body pitch")):
+        for axis, expected in zip(axes[row], (angles, others), strict=True):
+            curve = data(axis)
+            np.testing.assert_allclose(curve[:, 0], expected["time"])
+            np.testing.assert_allclose(curve[:, 1], expected[name], atol=1e-9)
+            dotted = [line for line in axis.get_lines() if line.get_linestyle() == ":"]
+            changes = [np.asarray(line.get_xdata(), float)[0] for line in dotted]
+            assert changes == [0, 10, 20], "a new target every 10 s"
+            assert axis.get_ylim() == pytest.approx((-7.35, 7.35)), "the steepest board fits"
+        assert [axis.get_ylabel() for axis in axes[row]] == [f"{name} [deg]", ""]
+    titles = ["".join(axis.get_title(loc=x) for x in ("left", "center")) for axis in axes[0]]
+    assert titles == [
+        "policy: mean tilt 0.40 deg, greatest 1.00 deg",  # a fifth of the time 1, else 0.25
+        "none: mean tilt 0.40 deg, greatest 1.00 deg, the robot fell",
+    ]
+    assert axes[3, 0].get_xlabel() == "time [s]; dotted: the board takes a new target"
+
+
+def test_a_runs_figures_are_drawn_from_what_they_are_given(
+    config: Config, scene: Scene, tmp_path: Path
+) -> None:
+    lines = [metrics_line(1_000, [1.0] * 6), metrics_line(2_000, [0.5] * 6)]
+    rollout, _ = made_up_rollout(config, scene, 5_500)
+    folder = tmp_path / "figures"
+    files = figures.draw_figures(folder, lines, config.task, scene, {"policy": rollout})
+    assert [file.name for file in files] == ["learning_curves.png", "reward.png", "rollout.png"]
+    assert sorted(folder.iterdir()) == sorted(files)
+    sizes = [imageio.imread(file).shape[:2] for file in files]
+    for (height, width), (tall, wide) in zip(sizes, ((6, 12), (3.4, 9), (7, 11)), strict=True):
+        assert 140 * wide < width < 160 * wide, "150 dots per inch"
+        assert 140 * tall < height < 160 * tall
+    assert not figures.plt.get_fignums(), "nothing stays in memory"
 
 
 @pytest.fixture(autouse=True)

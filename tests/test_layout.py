@@ -25,7 +25,7 @@ FLOORS = (
     ("engines", "engines.mjx", "engines.mujoco", "controllers"),
     ("env", "evaluation"),
     ("render", "display", "report"),
-    ("report.figures", "report.tables"),
+    ("report.figures", "report.tables", "report.digest"),
     ("report.reading",),
     ("report.measuring",),
     ("report.page",),

@@ -1,7 +1,7 @@
 """Policy and baselines on scenarios: everything that a report has to simulate."""
 
+import contextlib
 import dataclasses
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from mjx_balance import controllers
 from mjx_balance.controllers import CONTROLLERS, Controller, make_controller
 from mjx_balance.evaluation import (
     Envelope,
@@ -21,7 +20,17 @@ from mjx_balance.evaluation import (
     summarize,
 )
 from mjx_balance.policy import Policy
-from mjx_balance.report.reading import FOREIGN
+from mjx_balance.report.digest import code_digest
+from mjx_balance.report.reading import (
+    FOREIGN,
+    ReportError,
+    count,
+    number,
+    read_json,
+    section,
+    series,
+    suite_result,
+)
 from mjx_balance.scene import Scene
 from mjx_balance.suites import HEADLINE, SEEDS
 
@@ -40,7 +49,7 @@ class Measured:
     """A policy beside the baselines, on the same scenarios."""
 
     results: dict[str, dict[str, dict[str, Any]]]
-    """Controller -> suite -> JSON of `evaluation.summarize`."""
+    """Controller -> suite -> `reading.suite_result`."""
     shares: dict[str, dict[str, list[float]]]
     """Controller -> suite -> share of the physics steps per bin of tilt between `EDGES`."""
     envelope: Envelope
@@ -59,16 +68,64 @@ def measured(
       scenarios: per suite and controller.
       progress: title -> context manager that gives a callable taking the share done.
     """
-    key = [policy.fingerprint, scene.hash, baselines_digest()]
+    key = [policy.fingerprint, scene.hash, code_digest()]
     key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
-    try:
-        saved = json.loads(file.read_text())
+    with contextlib.suppress(*FOREIGN):  # whatever else lies there, it is measured again
+        saved = read_json(file)
         if saved["key"] == key:
-            return Measured(saved["results"], saved["shares"], Envelope(**saved["envelope"]))
-    except (*FOREIGN, OSError):
-        pass
+            return kept(saved)
     found = _measure(policy, scene, scenarios, progress)
-    file.write_text(json.dumps({"key": key, **dataclasses.asdict(found)}) + "\n")
+    with contextlib.suppress(OSError):  # a folder that cannot be written keeps nothing
+        file.write_text(json.dumps({"key": key, **dataclasses.asdict(found)}) + "\n")
+    return found
+
+
+def kept(saved: dict[str, Any]) -> Measured:
+    """Checks what was read back, value by value.
+
+    Raises:
+      ReportError: for a value that was not measured.
+      KeyError: for one that is missing.
+    """
+    names = ("policy", *CONTROLLERS)
+    mapped = section(saved["envelope"])
+    inclines, rates = (_numbers(mapped[name], None) for name in ("inclines", "rates"))
+    return Measured(
+        results={
+            name: {suite: suite_result(saved["results"][name][suite], suite) for suite in HEADLINE}
+            for name in names
+        },
+        shares={
+            name: {
+                suite: _numbers(saved["shares"][name][suite], len(EDGES) - 1) for suite in HEADLINE
+            }
+            for name in names
+        },
+        envelope=Envelope(
+            inclines=inclines,
+            rates=rates,
+            fall_rate=_grid(mapped["fall_rate"], len(inclines), len(rates)),
+            mean_tilt=_grid(mapped["mean_tilt"], len(inclines), len(rates)),
+            authority=number(mapped["authority"], "authority"),
+            reach=number(mapped["reach"], "reach"),
+            scenarios=count(mapped["scenarios"], "scenarios"),
+            duration_s=number(mapped["duration_s"], "duration_s"),
+            seed=count(mapped["seed"], "seed"),
+        ),
+    )
+
+
+def _numbers(values: Any, size: int | None) -> list[float]:
+    found = [number(value, "a value") for value in series(values, "a row")]
+    if len(found) != (len(found) if size is None else size):
+        raise ReportError(f"a row holds {len(found)} values, not {size}")
+    return found
+
+
+def _grid(values: Any, rows: int, columns: int) -> list[list[float]]:
+    found = [_numbers(row, columns) for row in series(values, "a grid")]
+    if len(found) != rows:
+        raise ReportError(f"a grid holds {len(found)} rows, not {rows}")
     return found
 
 
@@ -85,7 +142,8 @@ def _measure(
                 rollout = run_suite(
                     scene, policy.config, controller, suite, scenarios, DURATION, SEEDS.report, bar
                 )
-            results[name][suite] = summarize(rollout, suite, DURATION, SEEDS.report)
+            summary = summarize(rollout, suite, DURATION, SEEDS.report)
+            results[name][suite] = suite_result(summary, suite)
             counts, _ = np.histogram(rollout.tilt, EDGES)
             shares[name][suite] = (counts / counts.sum()).tolist()
     with progress("envelope") as bar:
@@ -127,8 +185,3 @@ def recorded(
 
 def _controller(name: str, policy: Policy, scene: Scene) -> Controller:
     return observing(policy) if name == "policy" else make_controller(name, scene, policy.config)
-
-
-def baselines_digest() -> str:
-    """Digest of the baselines' source: with it, what was measured of them holds."""
-    return hashlib.sha256(Path(controllers.__file__).read_bytes()).hexdigest()[:8]

@@ -91,7 +91,8 @@ def write_report(
         "commands": commands(runs, out),
         "versions": policy and versions(policy),
     }
-    out.write_text(render_page(page))
+    # Surrogates, as file names may hold them, have no UTF-8.
+    out.write_bytes(render_page(page).encode("utf-8", "replace"))
     return missing
 
 
@@ -297,6 +298,7 @@ def train_command(config: Config) -> str:
 
 
 def versions(policy: Policy) -> str:
-    """What the policy was trained with."""
-    known = policy.manifest["versions"].items()
-    return ", ".join(f"{name} {version}" for name, version in known if version)
+    """What the policy was trained with, as far as its manifest tells."""
+    known = policy.manifest.get("versions")
+    some = known.items() if isinstance(known, dict) else ()
+    return ", ".join(f"{name} {version}" for name, version in some if version)
