@@ -22,6 +22,7 @@ import numpy as np
 from markers import publish, table
 
 from mjx_balance.config import preset
+from mjx_balance.suites import HEADLINE
 
 
 def lags(samples: Iterable[int], commands: str) -> str:
@@ -95,7 +96,7 @@ def rows_of(name: str, args: argparse.Namespace) -> list[list[str]]:
         if not found:
             continue
         cells = [title, str(len(found))]
-        for suite in ("paper", "corner"):
+        for suite in HEADLINE:
             tilts = [result[suite]["tilt_deg"] for result in found]
             cells.append(str(sum(result[suite]["falls"] for result in found)))
             cells += [f"{np.mean([tilt[key] for tilt in tilts]):.3f}" for key in ("mean", "p95")]
@@ -116,7 +117,7 @@ def main() -> None:
     lines = []
     for name in args.presets:
         columns = [f"preset `{name}`", "seeds"]
-        for suite in ("paper", "corner"):
+        for suite in HEADLINE:
             columns += [f"`{suite}`: falls", "mean", "p95", "max"]
         lines += [*table(columns, rows_of(name, args)), ""]
         lines += [

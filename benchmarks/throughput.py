@@ -34,16 +34,16 @@ def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
     with quiet_imports():
         import jax
 
-        from mjx_balance import training
         from mjx_balance.env import BalanceEnv
+        from mjx_balance.training import devices
     from mjx_balance.config import preset
 
     config = dataclasses.replace(preset(preset_name), num_envs=num_envs)
-    training.configure_jax()
+    devices.configure_jax()
     jax.config.update("jax_enable_compilation_cache", False)  # to time the compilation
-    config = training.size_to_device(config)
+    config = devices.size_to_device(config)
     env = BalanceEnv(config)
-    learner = training.make_learner(config, env)
+    learner = devices.make_learner(config, env)
     iterations = max(1, DECISIONS_PER_CALL // num_envs)
     decisions = iterations * num_envs
 
@@ -88,13 +88,16 @@ def _random_program(learner, iterations: int) -> Callable[..., Any]:
     import jax
     import jax.numpy as jnp
 
-    from mjx_balance.dqn.learner import AXIS, REPLICATED
+    from mjx_balance.dqn.collecting import reset_done
+    from mjx_balance.dqn.devices import device_key
+    from mjx_balance.dqn.learner import REPLICATED
+
+    env = learner.env
 
     def step(state, key):
-        key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
-        count = state.reward.shape[0]
-        action = jax.random.randint(key, (count,), 0, learner.env.action_size)
-        return learner.reset_done(jax.vmap(learner.env.step)(state, action), key), None
+        key_act, key_reset = jax.random.split(device_key(key))
+        action = jax.random.randint(key_act, state.reward.shape, 0, env.action_size)
+        return reset_done(env.reset, jax.vmap(env.step)(state, action), key_reset), None
 
     def program(state, key):
         state, _ = jax.lax.scan(step, state, jax.random.split(key, iterations))

@@ -136,7 +136,7 @@ class TaskConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RandomizationConfig:
-    """What differs from world to world; off by default, as in the paper.
+    """What differs from env to env; off by default, as in the paper.
 
     Used twice: as domain randomisation in training, and to define the evaluation suites.
     """
@@ -158,7 +158,7 @@ class RandomizationConfig:
     gain_spread: float = bounded(0.0, least=0, below=1)
     """Servo gains differ by up to this share."""
     latency_share: float = bounded(0.0, least=0, most=1)
-    """Share of the worlds that take every action one decision late."""
+    """Share of the envs that take every action one decision late."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,6 +27,7 @@ from mjx_balance.config import (
     shown,
     to_dict,
 )
+from mjx_balance.dqn import heads
 from mjx_balance.robots import find_robot
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
@@ -78,18 +79,15 @@ class Policy:
         _check_weights(weights, shapes)
         self._layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
         if self.radial:
-            self._profile = np.logaddexp(0, weights["profile"])
-            self._stretch = np.exp(weights["stretch"])
-            axes = [np.linspace(-1, 1, levels) for levels in self.factors]
-            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-            self._points = points.reshape(-1, len(self.factors)).astype(np.float32)
+            self._profile, self._stretch = weights["profile"], weights["stretch"]
+            self._points = heads.points(self.factors)
 
     @property
     def fingerprint(self) -> str:
         """Short digest of the weights."""
         arrays = [array for layer in self._layers for array in layer]
-        if self.radial:
-            arrays += [self._profile, self._stretch]
+        if self.radial:  # as they enter the head
+            arrays += [np.logaddexp(0, self._profile), np.exp(self._stretch)]
         return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
     def q_values(self, obs: np.ndarray) -> np.ndarray:
@@ -113,18 +111,10 @@ class Policy:
         for kernel, bias in self._layers[:-1]:
             x = np.maximum(x @ kernel + bias, 0.0)
         kernel, bias = self._layers[-1]
-        if self.radial:
-            out = np.concatenate((x, obs), axis=-1) @ kernel + bias
-            alpha, beta, kappa, delta = self._profile
-            away = (self._points - out[..., None, 1:]) * self._stretch
-            z = np.sqrt(delta**2 + np.sum(away**2, axis=-1))
-            return out[..., :1] + alpha * np.exp(-beta * z) - kappa * z
-        branches = np.split(x @ kernel + bias, np.cumsum(self.factors)[:-1], axis=-1)
-        values = branches[0]
-        for branch in branches[1:]:
-            values = values[..., :, None] + branch[..., None, :]
-            values = values.reshape(*values.shape[:-2], -1)
-        return values
+        if not self.radial:
+            return heads.added_up(x @ kernel + bias, self.factors)
+        out = np.concatenate((x, obs), axis=-1) @ kernel + bias
+        return heads.radial(out, self._profile, self._stretch, self._points)
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """Index of the best action: () for (obs_size,), (batch,) for (batch, obs_size)."""

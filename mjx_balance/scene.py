@@ -222,12 +222,12 @@ _HASHED = (
     "body_parentid body_mass body_inertia body_ipos body_iquat body_pos body_quat "
     "body_gravcomp jnt_type jnt_axis jnt_pos jnt_range jnt_limited jnt_solref jnt_solimp "
     "jnt_margin jnt_stiffness jnt_actfrclimited jnt_actfrcrange qpos0 qpos_spring "
-    "dof_armature dof_damping dof_frictionloss dof_solref dof_solimp actuator_trntype "
-    "actuator_trnid actuator_dyntype actuator_dynprm actuator_gaintype actuator_gainprm "
-    "actuator_biastype actuator_biasprm actuator_forcelimited actuator_forcerange "
-    "actuator_ctrllimited actuator_ctrlrange actuator_gear site_bodyid site_pos site_quat "
-    "pair_friction pair_solref pair_solimp pair_margin pair_gap pair_dim pair_solreffriction "
-    "sensor_type sensor_objid sensor_cutoff"
+    "dof_parentid dof_armature dof_damping dof_frictionloss dof_solref dof_solimp "
+    "actuator_trntype actuator_trnid actuator_dyntype actuator_dynprm actuator_gaintype "
+    "actuator_gainprm actuator_biastype actuator_biasprm actuator_forcelimited "
+    "actuator_forcerange actuator_ctrllimited actuator_ctrlrange actuator_gear site_bodyid "
+    "site_pos site_quat pair_friction pair_solref pair_solimp pair_margin pair_gap pair_dim "
+    "pair_solreffriction sensor_type sensor_objid sensor_cutoff sensor_noise"
 ).split()
 _HASHED_OPTIONS = (
     "timestep gravity wind density viscosity integrator cone impratio jacobian solver iterations "
@@ -246,10 +246,10 @@ def scene_hash(model: mujoco.MjModel) -> str:
       16 hexadecimal digits.
     """
     digest = hashlib.sha256()
-    collides = np.isin(np.arange(model.ngeom), np.r_[model.pair_geom1, model.pair_geom2])
+    touching = np.r_[model.pair_geom1, model.pair_geom2]
     parts = [getattr(model, name) for name in _HASHED]
     geoms = (model.geom_type, model.geom_size, model.geom_pos, model.geom_quat, model.geom_bodyid)
-    parts += [field[collides] for field in geoms]
+    parts += [field[touching] for field in geoms]
     parts += [getattr(model.opt, name) for name in _HASHED_OPTIONS]
     for part in parts:
         digest.update(",".join(f"{x:.6g}" for x in np.ravel(part)).encode() + b";")

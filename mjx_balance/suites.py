@@ -69,6 +69,34 @@ SUITES: dict[str, Suite] = {
 """By the names of `mjx-balance evaluate --suite`."""
 
 
+HEADLINE = ("paper", "corner")
+"""Suites of the figures that come first: after training, in reports and tables."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Seeds:
+    """Seeds of scenarios, one per purpose, so that none is used for two.
+
+    Training draws from other generators and sees none of them.
+    """
+
+    final: int = 1_000_000
+    """Evaluation after training."""
+    record: int = 2_000_000
+    """Rollouts drawn as figures."""
+    validation: int = 3_000_000
+    """Choice among several training seeds; never reported."""
+    report: int = 4_000_000
+    """Policy against baselines, in a report."""
+    tuning: int = 5_000_000
+    """Gains of the baselines."""
+    held_out: int = 7_000_000
+    """Published results."""
+
+
+SEEDS = Seeds()
+
+
 def find_suite(name: str) -> Suite:
     """Returns the suite called `name`; raises `SuiteError` with the known names."""
     if name not in SUITES:

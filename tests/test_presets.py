@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import PRESETS, Config, ConfigError, check, preset
-from mjx_balance.training import size_to_device
+from mjx_balance.training.devices import size_to_device
 
 
 def with_dqn(config: Config, **changes: float) -> Config:

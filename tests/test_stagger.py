@@ -5,6 +5,7 @@ import numpy as np
 
 from mjx_balance.config import Config
 from mjx_balance.env import BalanceEnv
+from mjx_balance.training.devices import make_learner, size_to_device
 
 COUNT = 600
 
@@ -23,3 +24,9 @@ def test_first_episodes_are_of_every_length(config: Config) -> None:
     # Uniform: each quarter of the length has a quarter of the envs, within 4 standard deviations.
     quarters = np.histogram(first, 4, (1, length + 1))[0]
     assert np.abs(quarters - COUNT / 4).max() < 4 * np.sqrt(COUNT * 3 / 16)
+
+
+def test_a_run_begins_with_them(config: Config) -> None:
+    sized = size_to_device(config)
+    env = BalanceEnv(sized)
+    assert make_learner(sized, env).first_reset == env.reset_staggered

@@ -180,9 +180,9 @@ def test_a_second_start_compiles_nothing(run: Path, cache: dict[str, str], tmp_p
 
 
 def test_a_half_written_line_does_not_stop_a_resumed_run(tmp_path: Path) -> None:
-    from mjx_balance.training import _drop_metrics_after
+    from mjx_balance.training.loop import drop_metrics_after
 
     log = tmp_path / "metrics.jsonl"
     log.write_text('{"env_steps": 1024}\n{"env_steps": 2048}\n{"env_steps": 3072}\n{"env_st')
-    _drop_metrics_after(log, 2048)
+    drop_metrics_after(log, 2048)
     assert log.read_text() == '{"env_steps": 1024}\n{"env_steps": 2048}\n'

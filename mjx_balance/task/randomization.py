@@ -9,11 +9,11 @@ from mjx_balance.robots import Robot
 from mjx_balance.task import Array
 
 DRAWS = 6
-"""Uniform random numbers that one world's conditions take."""
+"""Uniform random numbers that the conditions of one env or scenario take."""
 
 
 class Conditions(NamedTuple):
-    """The circumstances of one world, or of a batch of them."""
+    """The circumstances of one env or scenario, or of a batch of them."""
 
     imu_noise: Array
     """(..., 6) standard deviation of every IMU sample, rad/s and m/s^2."""

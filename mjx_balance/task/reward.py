@@ -27,14 +27,14 @@ def reward_terms(task: TaskConfig, before: Array, after: Array, fell: Array) -> 
       fell: (...) 1 where the body failed on the way, else 0.
 
     Returns:
-      level: Eq. 4, w * exp(-1.5 * abs(tilt)).
+      level: Eq. 4, w * exp(-1.5 * tilt); a tilt is never negative.
       toward: Fig. 5, w * clip((before - after) / scale, -1, 1).
       fail: -0.5 on a fall.
     """
     xp = after.__array_namespace__()
     gain = xp.clip((before - after) / task.reward_toward_scale, -1.0, 1.0)
     return {
-        "level": task.reward_level * xp.exp(-task.reward_sharpness * xp.abs(after)),
+        "level": task.reward_level * xp.exp(-task.reward_sharpness * after),
         "toward": task.reward_toward * gain,
         "fail": task.reward_fail * fell,
     }

@@ -34,7 +34,7 @@ def enable_compilation_cache() -> None:
 def digest(*parts: object) -> str:
     """Fingerprint of `parts`, this package's code, its scenes, the libraries and devices."""
     state = hashlib.sha256(repr(parts).encode())
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     for path in sorted([*package.rglob("*.py"), *scene_dir().glob("*.xml")]):
         state.update(path.read_bytes())
     for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax"):

@@ -1,0 +1,104 @@
+"""What a run computes on: one process, its JAX devices, their memory, the learner over them."""
+
+import contextlib
+import dataclasses
+import math
+import os
+
+import jax
+import psutil
+
+from mjx_balance.config import Config, ConfigError, check
+from mjx_balance.dqn.learner import Learner
+from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.env import BalanceEnv
+from mjx_balance.policy import action_factors
+from mjx_balance.training.program_cache import enable_compilation_cache
+
+STATE_COPIES = 2
+"""A checkpoint is read back beside the state that it replaces."""
+PROGRAM_BYTES = 1.3 * 2**30
+"""Memory of a run besides its state: libraries, compiler, program (benchmarks/README.md)."""
+CPU_ENVS = 256
+ACCELERATOR_ENVS = 2048
+
+
+def configure_jax() -> None:
+    """Makes every CPU core a JAX device and turns the compilation cache on."""
+    # Too late if JAX is already in use, as in a notebook: its devices do as they are.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+    enable_compilation_cache()
+
+
+def size_to_device(config: Config) -> Config:
+    """Fills in what the config leaves to the device.
+
+    Raises:
+      ConfigError: if the envs cannot be spread over that many devices.
+    """
+    available = jax.devices()
+    on_cpu = available[0].platform == "cpu"
+    num_envs, batch_size = config.num_envs, config.dqn.batch_size
+    if num_envs is None:
+        num_envs = CPU_ENVS if on_cpu else ACCELERATOR_ENVS
+    num_devices = config.num_devices
+    if num_devices is None:
+        num_devices = _even_share(len(available), num_envs, batch_size)
+    elif num_devices > len(available):
+        raise ConfigError(
+            f"num_devices is {num_devices}; this machine has {len(available)} JAX devices"
+        )
+    for name, value in (("num_envs", num_envs), ("batch_size", batch_size)):
+        if value % num_devices:
+            raise ConfigError(
+                f"{name} is {value}; it must be a multiple of num_devices, {num_devices}"
+            )
+    sized = dataclasses.replace(config, num_envs=num_envs, num_devices=num_devices)
+    return check(sized)
+
+
+def _even_share(available: int, *counts: int) -> int:
+    """As many devices as share each of the counts out evenly."""
+    return next(n for n in range(available, 0, -1) if not any(count % n for count in counts))
+
+
+def make_learner(config: Config, env: BalanceEnv) -> Learner:
+    """The DQN for a config that `size_to_device` has completed."""
+    assert config.num_envs is not None
+    assert config.num_devices is not None
+    return Learner(
+        env,
+        QNetwork(config.dqn.hidden_sizes, action_factors(config), config.dqn.head == "radial"),
+        config.dqn,
+        config.num_envs,
+        config.num_env_steps,
+        jax.devices()[: config.num_devices],
+        config.num_seeds,
+        env.symmetries,
+        env.action_factors,
+        env.reset_staggered,
+    )
+
+
+def check_memory(learner: Learner) -> None:
+    """Refuses a state that would not fit, before anything is allocated.
+
+    Raises:
+      ConfigError: with the estimate.
+    """
+    shapes = jax.eval_shape(lambda: learner.init(0))
+    state = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes))
+    needed = STATE_COPIES * state + PROGRAM_BYTES
+    device = learner.mesh.devices.ravel()[0]
+    if device.platform == "cpu":
+        available = psutil.virtual_memory().available
+    else:
+        needed /= learner.num_devices
+        available = (device.memory_stats() or {}).get("bytes_limit", math.inf)
+    if needed > available:
+        raise ConfigError(
+            f"num_seeds is {learner.num_seeds}, num_envs {learner.num_envs} and replay_capacity "
+            f"{learner.config.replay_capacity}: that takes about {needed / 2**30:.1f} GiB, and "
+            f"{available / 2**30:.1f} GiB are free; lower one of them"
+        )
