@@ -299,6 +299,17 @@ def test_where_physics_diverged_the_last_sample_is_held(
     assert float(after.tilt[1]) == 6
 
 
+@pytest.mark.parametrize(("size", "diverged"), [(-2e4, True), (2e4, True), (5e3, False)])
+def test_a_hard_bump_is_no_divergence(
+    task: TaskConfig, robot: Robot, size: float, diverged: bool
+) -> None:
+    """A robot may feel hundreds of g; thousands are a simulation's."""
+    samples, tilts, angles = readings()
+    samples[2, 0, 5] = size
+    _, outcome = decision.outcome(task, robot, random_memory(task), samples, tilts, angles)
+    assert outcome.diverged.tolist() == outcome.fell.tolist() == [False, False, diverged]
+
+
 def test_one_robot_is_a_row_of_a_batch(task: TaskConfig, robot: Robot) -> None:
     """What training does, one robot vmapped in JAX, and evaluation, all at once in NumPy."""
     memory, (samples, tilts, angles) = random_memory(task), readings()
