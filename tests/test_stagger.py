@@ -1,32 +1,31 @@
 """First episodes end at different times, later ones have their whole length."""
 
+import dataclasses
+
 import jax
 import numpy as np
+from fleet import ENVS, EPISODE, Fleet
 
-from mjx_balance.config import Config
-from mjx_balance.env import BalanceEnv
 from mjx_balance.training.devices import make_learner, size_to_device
 
-COUNT = 600
+
+def test_first_episodes_are_of_every_length(fleet: Fleet) -> None:
+    keys = jax.random.split(jax.random.PRNGKey(0), 20 * EPISODE)
+    state = jax.jit(jax.vmap(fleet.env.reset_staggered))(keys)
+    left = np.asarray(state.info["decisions_left"])
+    # Uniform over 1 to EPISODE: each 20 times, within 5 standard deviations.
+    counts = np.bincount(left, minlength=EPISODE + 1)
+    assert counts[0] == 0
+    assert len(counts) == EPISODE + 1
+    assert np.abs(counts[1:] - 20).max() < 5 * np.sqrt(20)
+    assert len(np.unique(np.asarray(state.info["scenario"].phase))) == len(keys)
 
 
-def test_first_episodes_are_of_every_length(config: Config) -> None:
-    env = BalanceEnv(config)
-    keys = jax.random.split(jax.random.PRNGKey(0), COUNT)
-    first, later = (
-        np.asarray(jax.jit(jax.vmap(reset))(keys).info["decisions_left"])
-        for reset in (env.reset_staggered, env.reset)
-    )
-    length = config.task.episode_length
-    assert (later == length).all()
-    assert first.min() >= 1
-    assert first.max() <= length
-    # Uniform: each quarter of the length has a quarter of the envs, within 4 standard deviations.
-    quarters = np.histogram(first, 4, (1, length + 1))[0]
-    assert np.abs(quarters - COUNT / 4).max() < 4 * np.sqrt(COUNT * 3 / 16)
+def test_a_later_episode_has_its_whole_length(fleet: Fleet) -> None:
+    left = fleet.reset(jax.random.split(jax.random.PRNGKey(1), ENVS)).info["decisions_left"]
+    assert (np.asarray(left) == EPISODE).all()
 
 
-def test_a_run_begins_with_them(config: Config) -> None:
-    sized = size_to_device(config)
-    env = BalanceEnv(sized)
-    assert make_learner(sized, env).first_reset == env.reset_staggered
+def test_a_run_begins_with_staggered_episodes(fleet: Fleet) -> None:
+    sized = size_to_device(dataclasses.replace(fleet.env.config, num_envs=ENVS))
+    assert make_learner(sized, fleet.env).first_reset == fleet.env.reset_staggered
