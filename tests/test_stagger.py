@@ -18,7 +18,7 @@ def test_first_episodes_are_of_every_length(fleet: Fleet) -> None:
     assert counts[0] == 0
     assert len(counts) == EPISODE + 1
     assert np.abs(counts[1:] - 20).max() < 5 * np.sqrt(20)
-    assert len(np.unique(np.asarray(state.info["scenario"].phase))) == len(keys)
+    assert len(np.unique(np.asarray(state.info["scenario"].phase))) > 0.99 * len(keys)
 
 
 def test_a_later_episode_has_its_whole_length(fleet: Fleet) -> None:
