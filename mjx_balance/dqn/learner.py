@@ -30,7 +30,6 @@ from mjx_balance.dqn.replay import ReplayState, Transition
 from mjx_balance.dqn.updating import (
     LearnerState,
     Params,
-    QValues,
     Symmetries,
     make_optimizer,
     mirrored,
@@ -50,9 +49,10 @@ class TrainState(NamedTuple):
     params: Params
     """Of a network that takes whitened observations, where `whiten_steps` asks for that."""
     target_params: Params
+    """Of one that takes raw observations, as `params` were when it was last copied."""
     opt_state: optax.OptState
     inputs: InputStatistics
-    """Mean and covariance of the observations."""
+    """What is known of the observations."""
     env_state: State
     """(num_envs, ...) per leaf, sharded."""
     replay: ReplayState
@@ -146,11 +146,16 @@ class Learner:
           iterations: decisions of every env per call. Metrics are means over them, with a
             leading seed axis if there are several seeds.
         """
+        iteration = self._each_seed(self.iteration, in_axes=(0, None))
+
+        def step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
+            # The same for all seeds: asked here, the branch not taken costs nothing.
+            watching = state.env_steps.max() < self.config.whiten_steps
+            return iteration(state, watching)
 
         def program(state: TrainState) -> tuple[TrainState, Metrics]:
             self.trace_count += 1
-            step = self._each_seed(self.iteration)
-            state, metrics = jax.lax.scan(lambda s, _: step(s), state, length=iterations)
+            state, metrics = jax.lax.scan(step, state, length=iterations)
             return state, jax.tree.map(lambda x: x.mean(axis=0), metrics)
 
         return jax.jit(
@@ -166,11 +171,16 @@ class Learner:
 
     def exported(self, state: TrainState) -> Params:
         """The parameters of one run (no seed axis) for a network that takes raw observations."""
-        whiten = self._whitener(state.inputs)
-        return state.params if whiten is None else self.network.folded(state.params, *whiten)
+        return self._folded(state.params, state.inputs)
 
-    def _each_seed(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        return jax.vmap(function) if self.num_seeds > 1 else function
+    def _folded(self, params: Params, inputs: InputStatistics) -> Params:
+        """Folds the whitening in: the small kernel instead of every observation."""
+        if not self.config.whiten_steps:
+            return params
+        return self.network.folded(params, inputs.mean, inputs.matrix)
+
+    def _each_seed(self, function: Callable[..., Any], in_axes: Any = 0) -> Callable[..., Any]:
+        return jax.vmap(function, in_axes) if self.num_seeds > 1 else function
 
     def initial(self, key: jax.Array) -> TrainState:
         """The state of one new run; runs on each device."""
@@ -179,13 +189,14 @@ class Learner:
         env_state = fresh(self.first_reset, device_key(key_env), local_envs)
         obs = array(env_state.obs)[0]
         params = self.network.init(key_params, obs)
+        inputs = whitening.init(len(obs), self.config.whiten_floor)
         scalar = jnp.float32(0.0)
         example = Transition(obs, jnp.int32(0), scalar, scalar, obs)
         return TrainState(
             params=params,
-            target_params=jax.tree.map(jnp.copy, params),
+            target_params=jax.tree.map(jnp.copy, self._folded(params, inputs)),
             opt_state=self.optimizer.init(params),
-            inputs=whitening.init(obs.shape[-1]),
+            inputs=inputs,
             env_state=env_state,
             replay=replay.init(
                 example, self.config.replay_capacity // self.num_devices, local_envs
@@ -195,52 +206,57 @@ class Learner:
             key=key,
         )
 
-    def iteration(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        """One decision of every env of one run, then its updates; runs on each device."""
+    def iteration(self, state: TrainState, watching: jax.Array) -> tuple[TrainState, Metrics]:
+        """One decision of every env of one run, then its updates; runs on each device.
+
+        Args:
+          state: of one run, this device's part.
+          watching: () whether observations still add to the input statistics.
+        """
         key, key_act, key_reset, key_learn = jax.random.split(state.key, 4)
         rate = epsilon(self.config, state.env_steps)
-        if self.config.whiten_steps:
-            state = state._replace(inputs=self._watch(state))
-        q_values = self._q_values(self._whitener(state.inputs))
-        env_state, transition, metrics = self._collect(state, q_values, rate, key_act, key_reset)
+        inputs = jax.lax.cond(watching, self._watch, lambda state: state.inputs, state)
+        state = state._replace(inputs=inputs)
+        env_state, transition, metrics = self._collect(state, rate, key_act, key_reset)
         state = state._replace(
             env_state=env_state,
             replay=replay.add(state.replay, transition),
             env_steps=state.env_steps + self.num_envs,
             key=key,
         )
-        state, loss = self._learn(state, q_values, device_key(key_learn))
+        state, loss = self._learn(state, device_key(key_learn))
         return state, metrics | {"loss": loss, "epsilon": rate}
 
+    def _watch(self, state: TrainState) -> InputStatistics:
+        """Takes the present observations of all devices into account."""
+        obs = array(state.env_state.obs)
+        mean = jax.lax.pmean(obs.mean(axis=0), AXIS)
+        away = obs - mean
+        covariance = jax.lax.pmean(away.T @ away / len(obs), AXIS)
+        return whitening.update(state.inputs, mean, covariance, self.config.whiten_floor)
+
     def _collect(
-        self,
-        state: TrainState,
-        q_values: QValues,
-        rate: jax.Array,
-        key_act: jax.Array,
-        key_reset: jax.Array,
+        self, state: TrainState, rate: jax.Array, key_act: jax.Array, key_reset: jax.Array
     ) -> tuple[State, Transition, Metrics]:
         """Takes one decision of each of this device's envs."""
         obs = array(state.env_state.obs)
-        values = q_values(state.params, obs)
+        values = self._q_values(self._folded(state.params, state.inputs), obs)
         keys = jax.random.split(device_key(key_act), len(obs))
         act = partial(explore, factors=self.action_factors, levels=self.config.dither)
         action = jax.vmap(act, (0, 0, None))(keys, values, rate)
         return collect(self.env, state.env_state, action, device_key(key_reset))
 
-    def _learn(
-        self, state: TrainState, q_values: QValues, key: jax.Array
-    ) -> tuple[TrainState, jax.Array]:
+    def _learn(self, state: TrainState, key: jax.Array) -> tuple[TrainState, jax.Array]:
         """Makes one iteration's updates, once the replay is warm; returns the mean loss."""
         # The cosine runs over the updates of a whole run; none is made before the warm-up.
         capacity = state.replay.data.action.shape[0]
         wanted = min(self.config.min_replay_size // self.num_devices, capacity)
         keys = jax.random.split(key, self.updates)
+        fold = partial(self._folded, inputs=state.inputs)
 
         def step(learner: LearnerState, key: jax.Array) -> tuple[LearnerState, jax.Array]:
-            return update(
-                learner, self._batch(state.replay, key), q_values, self.optimizer, self.config
-            )
+            batch = self._batch(state.replay, key)
+            return update(learner, batch, self._q_values, fold, self.optimizer, self.config)
 
         before = LearnerState(*(getattr(state, name) for name in LearnerState._fields))
         after, losses = jax.lax.cond(
@@ -257,27 +273,7 @@ class Learner:
         batch = replay.sample(buffer, key, self.config.batch_size // self.num_devices)
         return batch if self.symmetries is None else mirrored(self.symmetries, batch, key_mirror)
 
-    def _watch(self, state: TrainState) -> InputStatistics:
-        """Takes the present observations of all devices into account, as long as it should."""
-        obs = array(state.env_state.obs)
-        mean = jax.lax.pmean(obs.mean(axis=0), AXIS)
-        away = obs - mean
-        covariance = jax.lax.pmean(away.T @ away / len(obs), AXIS)
-        seen = whitening.update(state.inputs, mean, covariance)
-        going_on = state.env_steps < self.config.whiten_steps
-        return jax.tree.map(lambda new, old: jnp.where(going_on, new, old), seen, state.inputs)
-
-    def _whitener(self, inputs: InputStatistics) -> tuple[jax.Array, jax.Array] | None:
-        if not self.config.whiten_steps:
-            return None
-        return inputs.mean, whitening.matrix(inputs, self.config.whiten_floor)
-
-    def _q_values(self, whiten: tuple[jax.Array, jax.Array] | None) -> QValues:
-        def q_values(params: Params, obs: jax.Array) -> jax.Array:
-            if whiten is not None:  # the small kernel instead of every observation
-                params = self.network.folded(params, *whiten)
-            values = self.network.apply(params, obs)
-            assert isinstance(values, jax.Array)
-            return values
-
-        return q_values
+    def _q_values(self, params: Params, obs: jax.Array) -> jax.Array:
+        values = self.network.apply(params, obs)
+        assert isinstance(values, jax.Array)
+        return values

@@ -22,7 +22,9 @@ class LearnerState(NamedTuple):
     """The part of the training state that an update changes."""
 
     params: Params
+    """Of a network that takes whitened observations."""
     target_params: Params
+    """Of one that takes raw ones: a copy keeps the whitening of its time."""
     opt_state: optax.OptState
     gradient_steps: jax.Array
 
@@ -69,11 +71,7 @@ def mirrored(symmetries: Symmetries, batch: Transition, key: jax.Array) -> Trans
 
 
 def loss(
-    params: Params,
-    target_params: Params,
-    batch: Transition,
-    q_values: QValues,
-    config: DQNConfig,
+    params: Params, target_params: Params, batch: Transition, q_values: QValues, config: DQNConfig
 ) -> jax.Array:
     """Mean squared TD error () of a batch (paper Eq. 1), or of Double DQN."""
     q_tm1 = q_values(params, batch.obs)
@@ -90,6 +88,7 @@ def update(
     state: LearnerState,
     batch: Transition,
     q_values: QValues,
+    fold: Callable[[Params], Params],
     optimizer: optax.GradientTransformation,
     config: DQNConfig,
 ) -> tuple[LearnerState, jax.Array]:
@@ -99,19 +98,24 @@ def update(
       state: the same on every device, before and after.
       batch: (share, ...) per field.
       q_values: what the network makes of parameters and observations.
+      fold: puts the whitening of inputs, as it is now, into parameters.
       optimizer: from `make_optimizer`.
       config: the algorithm.
 
     Returns:
       The state, and the loss () over all devices.
     """
-    loss_and_grads = jax.value_and_grad(loss)
-    value, grads = loss_and_grads(state.params, state.target_params, batch, q_values, config)
-    value, grads = jax.lax.pmean((value, grads), AXIS)
+
+    def whitened_loss(params: Params) -> jax.Array:
+        return loss(fold(params), state.target_params, batch, q_values, config)
+
+    value, grads = jax.lax.pmean(jax.value_and_grad(whitened_loss)(state.params), AXIS)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
     gradient_steps = state.gradient_steps + 1
-    target_params = optax.periodic_update(
-        params, state.target_params, gradient_steps, config.target_update_period
+    target_params = jax.lax.cond(
+        gradient_steps % config.target_update_period == 0,
+        lambda: fold(params),
+        lambda: state.target_params,
     )
     return LearnerState(params, target_params, opt_state, gradient_steps), value

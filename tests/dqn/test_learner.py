@@ -146,7 +146,7 @@ def test_no_key_is_used_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     signatures = key_reuse.key_reuse_signatures
     fold_in = next(primitive for primitive in signatures if primitive.name == "random_fold_in")
     monkeypatch.setitem(signatures, fold_in, once)
-    check(learner.iteration, state)
+    check(lambda state: learner.iteration(state, jnp.bool(True)), state)
 
 
 def test_traced_once_for_many_calls(noisy: tuple[Learner, Any, Any]) -> None:
@@ -246,3 +246,25 @@ class Several(probes.OneStep):
 def test_an_env_that_observes_a_dictionary_is_refused() -> None:
     with pytest.raises(TypeError, match="the env observes dict; this learner takes arrays"):
         make(Several()).init(0)
+
+
+@pytest.mark.parametrize("num_seeds", [1, 3])
+def test_the_whitening_matrix_is_computed_only_while_it_changes(num_seeds: int) -> None:
+    """Its eigenvalues stand in a branch that a finished gathering does not take."""
+    learner = make(probes.NoisyState(), num_seeds=num_seeds, whiten_steps=800)
+    state = jax.eval_shape(lambda: learner.init(0))
+    program = jax.make_jaxpr(learner.train_program(2))(state)
+    assert "eigh" in str(program)
+    assert not outside_of_conditions(program.jaxpr, "eigh")
+
+
+def outside_of_conditions(program: Any, primitive: str) -> bool:
+    """Whether a primitive occurs where it runs every time."""
+    for equation in program.eqns:
+        if equation.primitive.name == primitive:
+            return True
+        if equation.primitive.name != "cond":
+            inner = [getattr(x, "jaxpr", x) for x in equation.params.values()]
+            if any(outside_of_conditions(x, primitive) for x in inner if hasattr(x, "eqns")):
+                return True
+    return False
