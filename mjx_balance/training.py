@@ -235,7 +235,8 @@ def _learn(
             seconds += elapsed
             raw = jax.device_get(raw)
             raw["falls_per_minute"] = raw.pop("fall") * 60 / config.task.ctrl_dt
-            mean = {name: float(np.mean(value)) for name, value in raw.items()}
+            known = {name: np.ravel(x)[np.isfinite(np.ravel(x))] for name, x in raw.items()}
+            mean = {name: float(x.mean()) for name, x in known.items() if x.size}
             metrics = _named(config, mean, config.num_seeds * per_call / elapsed)
             line: dict[str, Any] = {
                 "env_steps": done,
@@ -243,7 +244,10 @@ def _learn(
                 **metrics,
             }
             if config.num_seeds > 1:
-                line["seeds"] = {name: raw[name].tolist() for name in PER_SEED}
+                line["seeds"] = {
+                    name: [x if math.isfinite(x) else None for x in raw[name].tolist()]
+                    for name in PER_SEED
+                }
             log.write(json.dumps(line) + "\n")
             log.flush()
             for name, value in metrics.items():

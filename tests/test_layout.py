@@ -20,7 +20,7 @@ FLOORS = (
         "suites",
         "policy",
         "run_folder",
-        *"dqn.acting dqn.networks dqn.replay dqn.losses dqn.whitening".split(),
+        *"dqn.acting dqn.means dqn.networks dqn.replay dqn.losses dqn.whitening".split(),
     ),
     ("plant", "dqn.collecting", "dqn.updating"),
     ("physics", "baselines", "evaluation", "dqn.learner"),

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
-from mjx_balance.dqn.devices import AXIS
+from mjx_balance.dqn.means import Mean, mean_where
 from mjx_balance.dqn.replay import Transition
 
 Reset: TypeAlias = Callable[[jax.Array], State]
 """PRNG key -> a fresh env."""
-Metrics: TypeAlias = dict[str, jax.Array]
 
 
 def fresh(reset: Reset, key: jax.Array, count: int) -> State:
@@ -33,7 +32,7 @@ def reset_done(reset: Reset, state: State, key: jax.Array) -> State:
 
 def collect(
     env: Env, before: State, action: jax.Array, key: jax.Array
-) -> tuple[State, Transition, Metrics]:
+) -> tuple[State, Transition, dict[str, Mean]]:
     """Steps this device's envs once and resets those that are done.
 
     Args:
@@ -54,8 +53,10 @@ def collect(
         terminated=after.done * (1 - truncation),
         next_obs=array(after.obs),
     )
-    metrics = jax.tree.map(jnp.mean, after.metrics | {"reward": after.reward})
-    return reset_done(env.reset, after, key), transition, jax.lax.pmean(metrics, AXIS)
+    every = jnp.ones_like(after.done, bool)
+    measured = after.metrics | {"reward": after.reward}
+    metrics = {name: mean_where(x, every) for name, x in measured.items()}
+    return reset_done(env.reset, after, key), transition, metrics
 
 
 def array(obs: object) -> jax.Array:

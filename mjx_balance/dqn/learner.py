@@ -11,7 +11,7 @@ seed axis and the iteration is vmapped over it.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,9 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import replay, whitening
 from mjx_balance.dqn.acting import epsilon, explore
-from mjx_balance.dqn.collecting import Metrics, Reset, array, collect, fresh
+from mjx_balance.dqn.collecting import Reset, array, collect, fresh
 from mjx_balance.dqn.devices import AXIS, device_key
+from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.dqn.replay import ReplayState, Transition
 from mjx_balance.dqn.updating import (
@@ -38,6 +39,7 @@ from mjx_balance.dqn.updating import (
 from mjx_balance.dqn.whitening import InputStatistics
 
 REPLICATED = PartitionSpec()
+Metrics: TypeAlias = dict[str, jax.Array]
 
 
 class TrainState(NamedTuple):
@@ -143,12 +145,13 @@ class Learner:
         """The jitted training program: state -> (state, metrics), the state donated.
 
         Args:
-          iterations: decisions of every env per call. Metrics are means over them, with a
-            leading seed axis if there are several seeds.
+          iterations: decisions of every env per call. Metrics are means over what happened
+            in them, with a leading seed axis if there are several seeds; NaN if nothing did,
+            as for the loss of a call without an update.
         """
         iteration = self._each_seed(self.iteration, in_axes=(0, None))
 
-        def step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
+        def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, Mean]]:
             # The same for all seeds: asked here, the branch not taken costs nothing.
             watching = state.env_steps.max() < self.config.whiten_steps
             return iteration(state, watching)
@@ -156,7 +159,8 @@ class Learner:
         def program(state: TrainState) -> tuple[TrainState, Metrics]:
             self.trace_count += 1
             state, metrics = jax.lax.scan(step, state, length=iterations)
-            return state, jax.tree.map(lambda x: x.mean(axis=0), metrics)
+            totals = jax.tree.map(lambda x: x.sum(axis=0), metrics)
+            return state, {name: mean.value() for name, mean in totals.items()}
 
         return jax.jit(
             jax.shard_map(
@@ -206,7 +210,9 @@ class Learner:
             key=key,
         )
 
-    def iteration(self, state: TrainState, watching: jax.Array) -> tuple[TrainState, Metrics]:
+    def iteration(
+        self, state: TrainState, watching: jax.Array
+    ) -> tuple[TrainState, dict[str, Mean]]:
         """One decision of every env of one run, then its updates; runs on each device.
 
         Args:
@@ -225,7 +231,7 @@ class Learner:
             key=key,
         )
         state, loss = self._learn(state, device_key(key_learn))
-        return state, metrics | {"loss": loss, "epsilon": rate}
+        return state, metrics | loss | {"epsilon": Mean(rate, jnp.float32(1.0))}
 
     def _watch(self, state: TrainState) -> InputStatistics:
         """Takes the present observations of all devices into account."""
@@ -237,7 +243,7 @@ class Learner:
 
     def _collect(
         self, state: TrainState, rate: jax.Array, key_act: jax.Array, key_reset: jax.Array
-    ) -> tuple[State, Transition, Metrics]:
+    ) -> tuple[State, Transition, dict[str, Mean]]:
         """Takes one decision of each of this device's envs."""
         obs = array(state.env_state.obs)
         values = self._q_values(self._folded(state.params, state.inputs), obs)
@@ -246,26 +252,31 @@ class Learner:
         action = jax.vmap(act, (0, 0, None))(keys, values, rate)
         return collect(self.env, state.env_state, action, device_key(key_reset))
 
-    def _learn(self, state: TrainState, key: jax.Array) -> tuple[TrainState, jax.Array]:
-        """Makes one iteration's updates, once the replay is warm; returns the mean loss."""
+    def _learn(self, state: TrainState, key: jax.Array) -> tuple[TrainState, dict[str, Mean]]:
+        """Makes one iteration's updates, once the replay is warm.
+
+        Returns:
+          The state; `loss` over the updates made.
+        """
         # The cosine runs over the updates of a whole run; none is made before the warm-up.
         capacity = state.replay.data.action.shape[0]
         wanted = min(self.config.min_replay_size // self.num_devices, capacity)
+        ready = state.replay.size >= wanted
         keys = jax.random.split(key, self.updates)
         fold = partial(self._folded, inputs=state.inputs)
+        nothing = Mean(jnp.float32(0.0), jnp.float32(0.0))
 
-        def step(learner: LearnerState, key: jax.Array) -> tuple[LearnerState, jax.Array]:
+        def step(learner: LearnerState, key: jax.Array) -> tuple[LearnerState, Mean]:
             batch = self._batch(state.replay, key)
             return update(learner, batch, self._q_values, fold, self.optimizer, self.config)
 
+        def learn(learner: LearnerState) -> tuple[LearnerState, Mean]:
+            learner, losses = jax.lax.scan(step, learner, keys)
+            return learner, jax.tree.map(jnp.sum, losses)
+
         before = LearnerState(*(getattr(state, name) for name in LearnerState._fields))
-        after, losses = jax.lax.cond(
-            state.replay.size >= wanted,
-            lambda learner: jax.lax.scan(step, learner, keys),
-            lambda learner: (learner, jnp.zeros(self.updates)),
-            before,
-        )
-        return state._replace(**after._asdict()), losses.mean()
+        after, loss = jax.lax.cond(ready, learn, lambda learner: (learner, nothing), before)
+        return state._replace(**after._asdict()), {"loss": loss}
 
     def _batch(self, buffer: ReplayState, key: jax.Array) -> Transition:
         """This device's share of a batch, reflected if asked for."""

@@ -10,6 +10,7 @@ import optax
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn.devices import AXIS
 from mjx_balance.dqn.losses import td_error
+from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.replay import Transition
 
 Params: TypeAlias = Any
@@ -91,7 +92,7 @@ def update(
     fold: Callable[[Params], Params],
     optimizer: optax.GradientTransformation,
     config: DQNConfig,
-) -> tuple[LearnerState, jax.Array]:
+) -> tuple[LearnerState, Mean]:
     """One gradient step on a batch of which each device has its share.
 
     Args:
@@ -118,4 +119,6 @@ def update(
         lambda: fold(params),
         lambda: state.target_params,
     )
-    return LearnerState(params, target_params, opt_state, gradient_steps), value
+    return LearnerState(params, target_params, opt_state, gradient_steps), Mean(
+        value, jnp.float32(1.0)
+    )

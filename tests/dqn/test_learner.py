@@ -192,13 +192,22 @@ def test_mirror_teaches_what_was_never_seen() -> None:
 
 
 def test_no_update_before_the_replay_is_warm() -> None:
-    """5 decisions of 8 envs are wanted: the fifth iteration is the first that learns."""
+    """5 decisions of 8 envs are wanted: the fifth iteration is the first that learns.
+
+    The loss is a mean over updates that were made, not over those that were not.
+    """
     learner = make(probes.OneStep(), min_replay_size=5 * ENVS)
     program = learner.train_program(1)
     state = learner.init(0)
+    losses = []
     for k in range(1, 8):
-        state, _ = program(state)
+        state, metrics = program(state)
+        losses.append(float(metrics["loss"]))
         assert int(state.gradient_steps) == max(k - 4, 0) * CONFIG.updates_per_step
+        assert np.isnan(losses[-1]) == (k < 5)
+    _, metrics = learner.train_program(7)(learner.init(0))
+    assert metrics["loss"] == pytest.approx(np.mean(losses[4:]), rel=1e-4)
+    assert metrics["reward"] == 1
 
 
 def test_learning_begins_even_if_the_replay_is_rounded_below_its_minimum() -> None:
