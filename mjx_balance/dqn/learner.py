@@ -23,7 +23,7 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import replay, whitening
 from mjx_balance.dqn.acting import epsilon, explore
-from mjx_balance.dqn.collecting import Reset, array, collect, fresh
+from mjx_balance.dqn.collecting import Collected, Reset, array, collect, finite, fresh
 from mjx_balance.dqn.devices import AXIS, device_key
 from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.networks import QNetwork
@@ -223,27 +223,31 @@ class Learner:
         rate = epsilon(self.config, state.env_steps)
         inputs = jax.lax.cond(watching, self._watch, lambda state: state.inputs, state)
         state = state._replace(inputs=inputs)
-        env_state, transition, metrics = self._collect(state, rate, key_act, key_reset)
+        seen = self._collect(state, rate, key_act, key_reset)
         state = state._replace(
-            env_state=env_state,
-            replay=replay.add(state.replay, transition),
+            env_state=seen.env_state,
+            replay=replay.add(state.replay, seen.transition, seen.storable),
             env_steps=state.env_steps + self.num_envs,
             key=key,
         )
         state, loss = self._learn(state, device_key(key_learn))
-        return state, metrics | loss | {"epsilon": Mean(rate, jnp.float32(1.0))}
+        return state, seen.metrics | loss | {"epsilon": Mean(rate, jnp.float32(1.0))}
 
     def _watch(self, state: TrainState) -> InputStatistics:
         """Takes the present observations of all devices into account."""
         obs = array(state.env_state.obs)
-        mean = jax.lax.pmean(obs.mean(axis=0), AXIS)
-        away = obs - mean
-        covariance = jax.lax.pmean(away.T @ away / len(obs), AXIS)
-        return whitening.update(state.inputs, mean, covariance, self.config.whiten_floor)
+        sound = jax.vmap(finite)(obs)[:, None]
+        count = jax.lax.psum(sound.sum(), AXIS)
+        mean: jax.Array = jax.lax.psum(jnp.where(sound, obs, 0.0).sum(axis=0), AXIS) / count
+        away = jnp.where(sound, obs - mean, 0.0)
+        covariance = jax.lax.psum(away.T @ away, AXIS) / count
+        seen = whitening.update(state.inputs, mean, covariance, self.config.whiten_floor)
+        usable = finite(seen)  # not if no observation was, or their squares are beyond numbers
+        return jax.tree.map(lambda new, old: jnp.where(usable, new, old), seen, state.inputs)
 
     def _collect(
         self, state: TrainState, rate: jax.Array, key_act: jax.Array, key_reset: jax.Array
-    ) -> tuple[State, Transition, dict[str, Mean]]:
+    ) -> Collected:
         """Takes one decision of each of this device's envs."""
         obs = array(state.env_state.obs)
         values = self._q_values(self._folded(state.params, state.inputs), obs)
@@ -256,7 +260,8 @@ class Learner:
         """Makes one iteration's updates, once the replay is warm.
 
         Returns:
-          The state; `loss` over the updates made.
+          The state; `loss` over the updates made, and `skipped_updates`, the share of those
+          that were not because something was not finite.
         """
         # The cosine runs over the updates of a whole run; none is made before the warm-up.
         capacity = state.replay.data.action.shape[0]
@@ -276,7 +281,8 @@ class Learner:
 
         before = LearnerState(*(getattr(state, name) for name in LearnerState._fields))
         after, loss = jax.lax.cond(ready, learn, lambda learner: (learner, nothing), before)
-        return state._replace(**after._asdict()), {"loss": loss}
+        skips = Mean(ready * (self.updates - loss.number), jnp.float32(self.updates))
+        return state._replace(**after._asdict()), {"loss": loss, "skipped_updates": skips}
 
     def _batch(self, buffer: ReplayState, key: jax.Array) -> Transition:
         """This device's share of a batch, reflected if asked for."""

@@ -1,4 +1,7 @@
-"""One gradient step: reflections, loss, clipped Adam, target network."""
+"""One gradient step: reflections, loss, clipped Adam, target network.
+
+A step whose loss or gradient is not a finite number is not made.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias
@@ -104,12 +107,13 @@ def update(
       config: the algorithm.
 
     Returns:
-      The state, and the loss () over all devices.
+      The state, and the loss over all devices: a mean of one, of none if the step was not made.
     """
 
     def whitened_loss(params: Params) -> jax.Array:
         return loss(fold(params), state.target_params, batch, q_values, config)
 
+    value: jax.Array
     value, grads = jax.lax.pmean(jax.value_and_grad(whitened_loss)(state.params), AXIS)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
@@ -119,6 +123,7 @@ def update(
         lambda: fold(params),
         lambda: state.target_params,
     )
-    return LearnerState(params, target_params, opt_state, gradient_steps), Mean(
-        value, jnp.float32(1.0)
-    )
+    sound = jnp.isfinite(value) & jnp.isfinite(optax.global_norm(grads))
+    made = LearnerState(params, target_params, opt_state, gradient_steps)
+    kept = jax.tree.map(lambda new, old: jnp.where(sound, new, old), made, state)
+    return kept, Mean(jnp.where(sound, value, 0.0), sound.astype(jnp.float32))
