@@ -99,7 +99,7 @@ class Walk(Probe):
 
     Observes (walk, steps taken); `walk` is drawn by the reset. Action a earns
     10 walk + steps + a / 2. The third step ends the walk, in a termination after action 1,
-    by time after action 0: the last observation, (walk, 3), is none of a reset.
+    by time after any other: the last observation, (walk, 3), is none of a reset.
     """
 
     @property
@@ -115,7 +115,7 @@ class Walk(Probe):
     def step(self, state: State, action: jax.Array) -> State:
         walk, steps = jnp.asarray(state.obs)
         last = steps == 2
-        ends, late = last & (action == 1), last & (action == 0)
+        ends, late = last & (action == 1), last & (action != 1)
         after = self._next(state, 0.0, 10 * walk + steps + action / 2, ends, late)
         obs = jnp.stack((walk, steps + 1))
         return after.replace(obs=obs, metrics={"steps": steps + 1})

@@ -277,3 +277,54 @@ def outside_of_conditions(program: Any, primitive: str) -> bool:
             if any(outside_of_conditions(x, primitive) for x in inner if hasattr(x, "eqns")):
                 return True
     return False
+
+
+def test_a_mirror_needs_symmetries() -> None:
+    config = dataclasses.replace(CONFIG, mirror=True)
+    with pytest.raises(ValueError, match="mirror is True, but no symmetries are given"):
+        Learner(probes.PositiveState(), QNetwork((4,), (2,)), config, ENVS, ENVS)
+
+
+def test_symmetries_are_used_only_where_the_config_says_so() -> None:
+    symmetries = probes.PositiveState.symmetries
+    learner = Learner(
+        probes.PositiveState(), QNetwork((4,), (2,)), CONFIG, ENVS, ENVS, symmetries=symmetries
+    )
+    assert learner.symmetries is None
+
+
+class Wide(probes.Walk):
+    """35 actions."""
+
+    @property
+    def action_size(self) -> int:
+        return 35
+
+
+def test_first_reset_begins_a_run_and_noise_follows_the_action_factors() -> None:
+    """Greedy actions are equal for equal observations; noise turns them to neighbours in (7, 5)."""
+
+    def late(key: jax.Array) -> Any:
+        state = probes.Walk().reset(key)
+        return state.replace(obs=jnp.asarray((5.0, 1.0)))
+
+    config = dataclasses.replace(CONFIG, dither=1, epsilon_start=0.0, epsilon_end=0.0)
+    network = QNetwork((4,), (35,))
+    learner = Learner(Wide(), network, config, 256, 2_560, action_factors=(7, 5), first_reset=late)
+    start = learner.init(0)
+    np.testing.assert_array_equal(start.env_state.obs, np.tile((5.0, 1.0), (256, 1)))
+    best = int(np.argmax(np.asarray(network.apply(start.params, jnp.asarray((5.0, 1.0))))))
+    program = learner.train_program(1)
+    state, _ = program(start)
+    actions = np.asarray(state.replay.data.action)[:128]
+    x, y = np.divmod(best, 5)
+    expected = {
+        5 * i + j
+        for i in range(max(x - 1, 0), min(x + 2, 7))
+        for j in range(max(y - 1, 0), min(y + 2, 5))
+    }
+    assert set(actions.tolist()) == expected
+    state, _ = program(state)  # the third step of a walk: a usual reset follows
+    obs = np.asarray(state.env_state.obs)
+    assert (obs[:, 0] < 1).all()
+    np.testing.assert_array_equal(obs[:, 1], 0)
