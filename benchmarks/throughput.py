@@ -95,10 +95,10 @@ def _random_program(learner, iterations: int) -> Callable[..., Any]:
     env = learner.env
 
     def step(state, key):
-        key = device_key(key)
+        key_act, key_reset = jax.random.split(device_key(key))
         count = state.reward.shape[0]
-        action = jax.random.randint(key, (count,), 0, env.action_size)
-        return reset_done(env.reset, jax.vmap(env.step)(state, action), key), None
+        action = jax.random.randint(key_act, (count,), 0, env.action_size)
+        return reset_done(env.reset, jax.vmap(env.step)(state, action), key_reset), None
 
     def program(state, key):
         state, _ = jax.lax.scan(step, state, jax.random.split(key, iterations))
