@@ -1,7 +1,6 @@
 """The DQN on environments with known values, on two devices."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +11,6 @@ import pytest
 from brax.envs.base import Env
 from jax.experimental.key_reuse import _core as key_reuse
 
-from mjx_balance.checkpoint import CheckpointError, Checkpoints
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import replay
 from mjx_balance.dqn.devices import AXIS
@@ -102,20 +100,25 @@ def test_bootstraps_from_the_target_network_alone(double: bool) -> None:
     np.testing.assert_allclose(values(learner, state, 1.0), (wanted, wanted), atol=0.1)
 
 
-def test_each_device_samples_its_share_of_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+def test_each_device_draws_its_own_share_of_every_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """32 rows per update are 16 of each device, and no device or update repeats another's."""
+    drawn = []
     sample = replay.sample
 
     def spy(state: Any, key: jax.Array, batch_size: int) -> Any:
-        asked.append(batch_size)
-        return sample(state, key, batch_size)
+        jax.debug.callback(lambda rows: drawn.append(tuple(rows.tolist())), key)
+        batch = sample(state, key, batch_size)
+        assert len(batch.action) == 16
+        return batch
 
     monkeypatch.setattr(replay, "sample", spy)
-    for count in (1, 2):
-        learner = make(probes.OneStep(), devices=jax.devices()[:count])
-        state = jax.eval_shape(lambda learner=learner: learner.init(0))
-        jax.eval_shape(learner.train_program(1), state)
-    assert set(asked) == {32, 16}
+    learner = make(probes.OneStep())
+    state, _ = learner.train_program(4)(learner.init(0))
+    jax.block_until_ready(state)
+    jax.effects_barrier()
+    updates = int(state.gradient_steps)
+    assert updates > 0
+    assert len(drawn) == len(set(drawn)) == 2 * updates
 
 
 def test_every_env_device_and_update_draws_by_itself() -> None:
@@ -216,25 +219,15 @@ def test_learning_begins_even_if_the_replay_is_rounded_below_its_minimum() -> No
     assert int(state.gradient_steps) > 0
 
 
-def test_a_restored_run_equals_an_uninterrupted_one(
-    tmp_path: Path, noisy: tuple[Learner, Any, Any]
-) -> None:
-    learner, program, state = noisy
-    state = jax.tree.map(jnp.copy, state)
-    checkpoints = Checkpoints(tmp_path / "checkpoints")
-    checkpoints.save(int(state.env_steps), state)
-    uninterrupted, _ = program(state)
-    resumed, _ = program(Checkpoints(tmp_path / "checkpoints").restore(learner.init(7)))
-    jax.tree.map(
-        lambda a, b: np.testing.assert_array_equal(jax.device_get(a), jax.device_get(b)),
-        resumed,
-        uninterrupted,
-    )
-
-
-def test_nothing_to_restore_is_said(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no checkpoint"):
-        Checkpoints(tmp_path / "checkpoints").restore({})
+def test_the_state_is_everything(noisy: tuple[Learner, Any, Any]) -> None:
+    """Copied to the host and back, with another learner, a run goes on as if nothing was."""
+    _, program, state = noisy
+    host = jax.device_get(state)
+    uninterrupted, _ = program(jax.tree.map(jnp.copy, state))
+    learner = make(probes.NoisyState())
+    placed = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), host, learner.init(7))
+    resumed, _ = learner.train_program(10)(placed)
+    jax.tree.map(np.testing.assert_array_equal, *jax.device_get((resumed, uninterrupted)))
 
 
 @pytest.mark.parametrize(
