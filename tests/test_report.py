@@ -199,6 +199,27 @@ def test_the_table_of_baselines_and_the_tiles(run: Path) -> None:
     assert "Plain MuJoCo, 40 held-out scenarios of 60 s per suite (seed 4000000)" in text
 
 
+def test_what_is_said_of_a_policy_is_said_of_its_own_task(run: Path) -> None:
+    policy = copy.copy(load_policy(run / "policy.safetensors"))
+    task = dataclasses.replace(
+        policy.config.task,
+        max_incline=5.5,
+        fail_tilt=8.0,
+        action_levels=11,
+        action_max=0.0025,
+        ctrl_dt=0.4,
+    )
+    policy.config = dataclasses.replace(policy.config, task=task)
+    shown = page.comparison(policy, made_up(policy))
+    assert shown["tiles"][1][1] == "mean tilt, both axes at 5.5° at once"
+    assert (
+        "from a fall on it counts as 8°. All take the same 11 x 11 actions at 2.5 Hz"
+        in shown["note"]
+    )
+    caption = page.envelope_caption(task, made_up(policy).envelope)
+    assert "cannot follow: 2.5 mm 2.5 times a second turn the body" in caption
+
+
 def test_the_pictures_of_a_policy_and_their_captions(
     run: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,7 +245,7 @@ def test_the_pictures_of_a_policy_and_their_captions(
     ]
     assert "suite corner (both axes at once" in pictures[1].caption
     assert pictures[3].caption.startswith("Targets on both axes at once, 3 scenarios of 31 s per")
-    assert "3 mm five times a second turn the body at 4.46 deg/s" in pictures[3].caption
+    assert "3 mm 5 times a second turn the body at 4.46 deg/s" in pictures[3].caption
     assert "the legs reach 10.3 deg. Inside, 75% of the cells" in pictures[3].caption
 
 

@@ -41,8 +41,8 @@ ENVELOPE_DURATION = 30.0
 RECORD_SECONDS = 100.0
 """As long as the paper's Fig. 7."""
 VIDEO_SECONDS = 12.0
-EDGES = np.concatenate(([0.0], np.geomspace(0.01, 6.0, 160), [6.0001]))
-"""Bins of the tilt distribution, deg."""
+BINS = 161
+"""Of the tilt distribution."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,9 +52,14 @@ class Measured:
     results: dict[str, dict[str, dict[str, Any]]]
     """Controller -> suite -> `reading.suite_result`."""
     shares: dict[str, dict[str, list[float]]]
-    """Controller -> suite -> share of the physics steps per bin of tilt between `EDGES`."""
+    """Controller -> suite -> (BINS,) share of the physics steps per bin of tilt (`edges`)."""
     envelope: Envelope
     """Of the policy."""
+
+
+def edges(fail_tilt: float) -> np.ndarray:
+    """(BINS + 1,) bounds of the tilt distribution, deg; a fall's tilt has the last bin."""
+    return np.concatenate(([0.0], np.geomspace(0.01, fail_tilt, BINS - 1), [fail_tilt + 1e-4]))
 
 
 def measured(
@@ -97,9 +102,7 @@ def kept(saved: dict[str, Any]) -> Measured:
             for name in names
         },
         shares={
-            name: {
-                suite: _numbers(saved["shares"][name][suite], len(EDGES) - 1) for suite in HEADLINE
-            }
+            name: {suite: _numbers(saved["shares"][name][suite], BINS) for suite in HEADLINE}
             for name in names
         },
         envelope=Envelope(
@@ -145,7 +148,7 @@ def _measure(
                 )
             summary = summarize(rollout, suite, DURATION, SEEDS.report)
             results[name][suite] = suite_result(summary, suite)
-            counts, _ = np.histogram(rollout.tilt, EDGES)
+            counts, _ = np.histogram(rollout.tilt, edges(policy.config.task.fail_tilt))
             shares[name][suite] = (counts / counts.sum()).tolist()
     with progress("envelope") as bar:
         mapped = envelope(
