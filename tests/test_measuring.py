@@ -123,11 +123,15 @@ def test_what_was_measured_is_kept(
     other = Policy(policy.manifest, weights_of(SHIPPED, by=1.001))
     measured(other, its_scene, file, 6, no_bar)
     assert len(calls) == 4 * count, "another network"
+    task = dataclasses.replace(policy.config.task, action_ramp=0.3)
+    other.config = dataclasses.replace(policy.config, task=task)
+    measured(other, its_scene, file, 6, no_bar)
+    assert len(calls) == 5 * count, "the same network in another task"
     monkeypatch.setattr(measuring, "ENVELOPE_SCENARIOS", 3)
     measured(other, its_scene, file, 6, no_bar)
     monkeypatch.setattr(measuring, "ENVELOPE_DURATION", 31.0)
     measured(other, its_scene, file, 6, no_bar)
-    assert len(calls) == 6 * count, "another envelope"
+    assert len(calls) == 7 * count, "another envelope"
 
 
 HOSTILE = "<img src=x onerror=alert(1)>"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mjx_balance.baselines import CONTROLLERS, make_controller
+from mjx_balance.config import to_dict
 from mjx_balance.evaluation import (
     Controller,
     Envelope,
@@ -74,7 +75,7 @@ def measured(
       scenarios: per suite and controller.
       progress: title -> context manager that gives a callable taking the share done.
     """
-    key = [policy.fingerprint, scene.hash, code_digest()]
+    key = [policy.fingerprint, to_dict(policy.config), scene.hash, code_digest()]
     key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
     with contextlib.suppress(*FOREIGN):  # whatever else lies there, it is measured again
         saved = read_json(file)
