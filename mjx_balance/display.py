@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 from rich.console import Console, Group
 from rich.live import Live
+from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import (
     BarColumn,
@@ -43,14 +44,14 @@ class Display:
 
     def say(self, message: str) -> None:
         """Prints one line."""
-        self.console.print(message, highlight=False, soft_wrap=True)
+        self.console.print(message, highlight=False, soft_wrap=True, markup=False)
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
         """Shows a step of unknown length, then how long it took."""
         began = time.perf_counter()
         if self.console.is_terminal:
-            with self.console.status(name):
+            with self.console.status(escape(name)):
                 yield
         else:
             self.say(f"{name} ...")
@@ -104,7 +105,12 @@ class Display:
     def bar(self, name: str) -> Iterator["Bar"]:
         """A step whose share done is known."""
         if self.console.is_terminal:
-            columns = (SpinnerColumn(), TextColumn(name), BarColumn(), TimeRemainingColumn())
+            columns = (
+                SpinnerColumn(),
+                TextColumn(escape(name)),
+                BarColumn(),
+                TimeRemainingColumn(),
+            )
             with Progress(*columns, console=self.console, transient=True) as progress:
                 yield Bar(progress)
         else:

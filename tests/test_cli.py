@@ -4,10 +4,19 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
+import videos
 
 from mjx_balance.cli import main
 from mjx_balance.config import preset, to_dict
+from mjx_balance.controllers import make_controller
+from mjx_balance.evaluation import observing, run_suite, summarize
+from mjx_balance.policy import load_policy
+from mjx_balance.render import VIDEO_SIZE
+from mjx_balance.scene import load_scene
+
+SHIPPED = Path(__file__).parent.parent / "policies" / "best.safetensors"
 
 
 @pytest.fixture(autouse=True)
@@ -44,8 +53,8 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (("--seed", "4294967296"), "seed is 4294967296"),
         (("--reward-tilt", "sideways"), "--reward-tilt"),
         (("--payload", "-1"), "payload is -1.0"),
-        (("--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
-        (("--thigh", "0.25"), "thigh is 0.25"),
+        (("--preset", "paper", "--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
+        (("--robot", "spot"), "robot is 'spot'; known robots: quadruped"),
         (("--learning-rate", "nan"), "learning_rate is nan"),
         (("--resume", "nowhere"), "nowhere is no run folder"),
     ],
@@ -130,3 +139,36 @@ def test_impossible_commands_are_refused(
     (tmp_path / "text").write_text("this is no policy")
     assert named in refuse(capsys, *arguments)
     assert (tmp_path / "text").read_text() == "this is no policy"
+
+
+@pytest.mark.parametrize("who", ["controller", "policy"])
+def test_evaluate_writes_figures_and_a_video(
+    who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """0.4 s of a baseline and of a policy, to the end of the command."""
+    names = ("--controller", "pd-imu") if who == "controller" else (str(SHIPPED),)
+    flags = "--suite corner --scenarios 2 --duration 0.4 --seed 5 --json out.json --video v.mp4"
+    code = main(("evaluate", *names, *flags.split()))
+    said = capsys.readouterr()
+    result = json.loads((tmp_path / "out.json").read_text())
+    config = preset("default") if who == "controller" else load_policy(SHIPPED).config
+    scene = load_scene(config)
+    chosen = (
+        make_controller("pd-imu", scene, config)
+        if who == "controller"
+        else observing(load_policy(SHIPPED))
+    )
+    rollout = run_suite(scene, config, chosen, "corner", 2, 0.4, 5)
+    expected = summarize(rollout, "corner", 0.4, 5)
+    speeds = [found.pop("physics_steps_per_second") for found in (result, expected)]
+    assert result == expected
+    assert result["duration_s"] == 0.4
+    assert "corner  2 x 0.4 s      0" in said.out
+    assert f"{speeds[0]:,.0f} physics steps per second" in said.out
+    if code == 1 and "no video written" in said.err:
+        pytest.skip(said.err)
+    assert code == 0
+    assert "video of the first scenario: v.mp4" in said.out
+    fps, frames = videos.read(tmp_path / "v.mp4")
+    assert (fps, len(frames), frames.shape[1:3]) == (25, 10, VIDEO_SIZE[::-1])
+    assert np.abs(frames[-1] - frames[0]).mean() > 0.1, "the board moves"

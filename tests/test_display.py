@@ -141,5 +141,10 @@ def test_a_bar_moves_to_the_share_that_is_done() -> None:
 
 def test_messages_are_printed_as_they_are() -> None:
     display, out = screen(terminal=False)
-    display.say("a path /" + "x" * 120)
-    assert out.getvalue() == "a path /" + "x" * 120 + "\n", "not wrapped"
+    message = "a path /[bold]" + "x" * 120
+    display.say(message)
+    assert out.getvalue() == f"{message}\n", "neither wrapped nor taken for markup"
+    display, out = screen(terminal=True)
+    with display.bar("evaluating [bold]"):
+        pass
+    assert "[bold]" in "".join(plain(out.getvalue()))

@@ -89,7 +89,7 @@ def test_shares_are_those_of_the_physics_steps_in_each_bin(
     policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
 ) -> None:
     found = measured(policy, its_scene, tmp_path / "report.json", 2, no_bar)
-    edges = measuring.EDGES
+    edges = measuring.edges(6.0)
     assert (edges[0], edges[1], edges[-2]) == (0, 0.01, pytest.approx(6))
     share = found.shares["policy"]["paper"]
     assert len(share) == len(edges) - 1
@@ -98,6 +98,9 @@ def test_shares_are_those_of_the_physics_steps_in_each_bin(
     holds_3 = int(np.searchsorted(edges, 3.0, side="right")) - 1
     assert share[holds_3] == 0.25
     assert sum(share) == 1
+    edges = measuring.edges(10.0)
+    assert edges[-2] == pytest.approx(10)
+    assert np.histogram([9.9, 10.0], edges)[0][-2:].tolist() == [1, 1], "up to where it fails"
 
 
 def test_what_was_measured_is_kept(
@@ -120,11 +123,15 @@ def test_what_was_measured_is_kept(
     other = Policy(policy.manifest, weights_of(SHIPPED, by=1.001))
     measured(other, its_scene, file, 6, no_bar)
     assert len(calls) == 4 * count, "another network"
+    task = dataclasses.replace(policy.config.task, action_ramp=0.3)
+    other.config = dataclasses.replace(policy.config, task=task)
+    measured(other, its_scene, file, 6, no_bar)
+    assert len(calls) == 5 * count, "the same network in another task"
     monkeypatch.setattr(measuring, "ENVELOPE_SCENARIOS", 3)
     measured(other, its_scene, file, 6, no_bar)
     monkeypatch.setattr(measuring, "ENVELOPE_DURATION", 31.0)
     measured(other, its_scene, file, 6, no_bar)
-    assert len(calls) == 6 * count, "another envelope"
+    assert len(calls) == 7 * count, "another envelope"
 
 
 HOSTILE = "<img src=x onerror=alert(1)>"

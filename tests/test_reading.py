@@ -1,13 +1,22 @@
 """What is read of a run folder: all there is, checked, and one sentence for the rest."""
 
+import copy
+import functools
 import json
+import shutil
+import time
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from mjx_balance.report import reading
+from mjx_balance.config import preset, to_dict
+from mjx_balance.report import page, reading
+from mjx_balance.report.reading import ReportError
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 
@@ -34,9 +43,9 @@ GOOD_LINE = json.dumps(metrics_line(0, 1))
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("config.json", "[]", "config.json cannot be used: Config is []; it must map"),
+        ("config.json", "[]", "config.json cannot be used: it is []; it must be a JSON"),
         ("config.json", '{"task": []}', "config.json cannot be used: TaskConfig is []"),
-        ("config.json", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a number"),
+        ("config.json", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a finite number"),
         ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_st', "metrics.jsonl is shown up to line 2"),
         ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_steps": 9999}}', "it has no 'train/tilt_deg'"),
         ("metrics.jsonl", f"{GOOD_LINE}\n5", "metrics.jsonl is shown up to line 2"),
@@ -95,7 +104,7 @@ HUGE = 10**400
         ("falls", True, "falls is True; it must be a whole number"),
         ("falls", 1.5, "falls is 1.5; it must be a whole number"),
         ("falls", -1, "falls is -1; it must be a whole number of at least 0"),
-        ("falls", HUGE, "falls is 1000"),
+        ("falls", HUGE, "falls is 10000"),
         ("falls", 9, "falls is 9; it must not exceed scenarios, 8"),
         ("scenarios", [8], "scenarios is [8]; it must be a whole number"),
         ("scenarios", None, "scenarios is None"),
@@ -202,3 +211,129 @@ def test_metrics_without_a_line_are_said(tmp_path: Path) -> None:
     (tmp_path / "metrics.jsonl").write_text("")
     said = "\n".join(reading.read_run(tmp_path).missing)
     assert "metrics.jsonl cannot be used: it holds no line yet" in said
+
+
+JSON = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.integers(10**15, 10**60)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.just(HOSTILE),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+RESULTS = {suite: evaluation_result(suite, 0.1) for suite in ("paper", "corner")}
+GOOD: dict[str, Any] = {
+    "config.json": to_dict(preset("default")),
+    "metrics.jsonl": [metrics_line(0, 2), metrics_line(1, 2)],
+    "evaluation.json": RESULTS,
+    "seeds.json": {"seeds": [{"evaluation": RESULTS}, {"evaluation": RESULTS}]},
+}
+
+
+def places(value: Any) -> list[tuple]:
+    """The paths of all values inside a JSON value."""
+    inside = value.items() if isinstance(value, dict) else enumerate(value)
+    found: list[tuple] = []
+    for key, part in inside:
+        found.append((key,))
+        if isinstance(part, (dict, list)):
+            found += [(key, *more) for more in places(part)]
+    return found
+
+
+def written(name: str, value: Any) -> bytes:
+    lines = value if name == "metrics.jsonl" and isinstance(value, list) else [value]
+    return "\n".join(map(json.dumps, lines)).encode("utf-8", "surrogatepass")
+
+
+@st.composite
+def damaged(draw: st.DrawFn) -> dict[str, bytes]:
+    """A run folder in which one file was exchanged, edited, cut off or flipped."""
+    files = {name: written(name, value) for name, value in GOOD.items()}
+    name = draw(st.sampled_from(sorted(GOOD)))
+    how = draw(st.sampled_from(("any JSON", "edited", "key lost", "cut off", "flipped", "garbage")))
+    if how == "any JSON":
+        files[name] = written(name, draw(JSON))
+    elif how in ("edited", "key lost"):
+        value = copy.deepcopy(GOOD[name])
+        *path, last = draw(st.sampled_from(places(value)))
+        inside = functools.reduce(lambda part, key: part[key], path, value)
+        if how == "key lost":
+            del inside[last]
+        else:
+            inside[last] = draw(JSON)
+        files[name] = written(name, value)
+    elif how == "cut off":
+        files[name] = files[name][: draw(st.integers(0, len(files[name]) - 1))]
+    elif how == "flipped":
+        content = bytearray(files[name])
+        content[draw(st.integers(0, len(content) - 1))] ^= draw(st.integers(1, 255))
+        files[name] = bytes(content)
+    else:
+        files[name] = draw(st.binary(max_size=64))
+    return files
+
+
+@settings(deadline=1_000, max_examples=300, suppress_health_check=[HealthCheck.too_slow])
+@given(files=damaged())
+def test_a_damaged_folder_is_read_as_far_as_it_goes(
+    tmp_path_factory: pytest.TempPathFactory, files: dict[str, bytes]
+) -> None:
+    folder = tmp_path_factory.mktemp("run")
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    run = reading.read_run(folder)
+    assert sum(bool(x) for x in (run.config, run.metrics, run.results)) >= 2, "one file is damaged"
+    for sentence in run.missing:
+        assert sentence.isprintable()
+        assert len(sentence) < 600
+        sentence.encode()
+    for line in run.metrics:
+        assert all(isinstance(line[name], (int, float)) for name in line if name != "seeds")
+    for results in run.results:
+        for suite, result in results.items():
+            assert result == reading.suite_result(result, suite)
+    page.seeds_table(run, [run, run])
+    shutil.rmtree(folder)
+
+
+UNITS = (b"[", b"[],", b"9", b"\n", b'{"a":', b"\xff", b'"', b"{}\n", b"1e9,")
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("name", sorted(GOOD))
+def test_a_flood_is_refused_soon_and_in_little_memory(
+    tmp_path: Path, name: str, unit: bytes
+) -> None:
+    for size in (reading.JSON_BYTES - 100, 16 * 2**20):
+        flood = unit * (size // len(unit))
+        if unit.endswith(b","):
+            flood = b"[%s0]" % flood
+        (tmp_path / name).write_bytes(flood)
+        began = time.process_time()
+        with pytest.raises(ReportError, match="is no run folder"):
+            reading.read_run(tmp_path)
+        assert time.process_time() - began < 1
+        tracemalloc.start()
+        with pytest.raises(ReportError, match="is no run folder"):
+            reading.read_run(tmp_path)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 150 * 2**20
+
+
+def test_a_flood_that_is_a_run_is_read_soon_and_in_little_memory(tmp_path: Path) -> None:
+    lines = (json.dumps(metrics_line(k, 5)) for k in range(12_000))
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
+    rows = ",".join(["{}"] * 700_000)
+    (tmp_path / "seeds.json").write_text(f'{{"seeds": [{rows}]}}')
+    began = time.process_time()
+    run = reading.read_run(tmp_path)
+    assert time.process_time() - began < 1
+    assert len(run.metrics) > 8_000
+    assert "its first 8 MiB are shown" in "".join(run.missing)

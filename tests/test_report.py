@@ -8,6 +8,8 @@ import json
 import re
 import shutil
 import subprocess
+import types
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from mjx_balance.cli import main
 from mjx_balance.config import Config, preset, to_dict
 from mjx_balance.evaluation import Envelope
 from mjx_balance.policy import Policy, load_policy, make_manifest, save_policy
+from mjx_balance.render import RenderError
 from mjx_balance.report import figures, measuring, page, reading
 from mjx_balance.report.measuring import Measured
 from mjx_balance.report.reading import Run
@@ -151,7 +154,10 @@ def made_up(policy: Policy) -> Measured:
                 "tilt_deg": tilt | {"rms": 9.9, "p50": 9.8, "p99": 9.7},
                 "action_mm_settled": None if k == 1 else 0.01 * k + n,
             }
-    shares = {name: {"paper": [0.5] + [0.0] * 160 + [0.5]} for name in results}
+    shares = {
+        name: {"paper": [0.5] + [0.0] * 159 + [0.5], "corner": [1.0] + [0.0] * 160}
+        for name in results
+    }
     envelope = Envelope(
         inclines=[2.0, 3.0, 20.0],
         rates=[2.5, 3.0, 9.0],
@@ -199,33 +205,119 @@ def test_the_table_of_baselines_and_the_tiles(run: Path) -> None:
     assert "Plain MuJoCo, 40 held-out scenarios of 60 s per suite (seed 4000000)" in text
 
 
+def test_what_is_said_of_a_policy_is_said_of_its_own_task(run: Path) -> None:
+    policy = copy.copy(load_policy(run / "policy.safetensors"))
+    task = dataclasses.replace(
+        policy.config.task,
+        max_incline=5.5,
+        fail_tilt=8.0,
+        action_levels=11,
+        action_max=0.0025,
+        ctrl_dt=0.4,
+    )
+    policy.config = dataclasses.replace(policy.config, task=task)
+    shown = page.comparison(policy, made_up(policy))
+    assert shown["tiles"][1][1] == "mean tilt, both axes at 5.5° at once"
+    assert (
+        "from a fall on it counts as 8°. All take the same 11 x 11 actions at 2.5 Hz"
+        in shown["note"]
+    )
+    caption = page.envelope_caption(task, made_up(policy).envelope)
+    assert "cannot follow: 2.5 mm 2.5 times a second turn the body" in caption
+
+
 def test_the_pictures_of_a_policy_and_their_captions(
     run: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn: dict[str, Any] = {}
+    drawn: list[tuple[str, Any]] = []
+
+    def drawing(name: str) -> Callable[..., bytes]:
+        return lambda *given: drawn.append((name, given)) or name.encode()
+
     for name in ("rollout_figure", "tilt_figure", "envelope_figure"):
-        monkeypatch.setattr(figures, name, lambda *given, name=name: (name, given))
-    monkeypatch.setattr(figures, "png", lambda figure: repr(figure[0]).encode())
+        monkeypatch.setattr(figures, name, drawing(name))
+    monkeypatch.setattr(figures, "png", lambda figure: figure)
     monkeypatch.setattr(measuring, "recorded", lambda *given: given)
     policy = load_policy(run / "policy.safetensors")
-    pictures = page.policy_pictures(policy, scene, made_up(policy))
-    assert [picture.title for picture in pictures] == [
-        "100 s on the board: paper",
-        "100 s on the board: corner",
-        "Tilt distribution",
-        "Envelope",
+    found = made_up(policy)
+    pictures = page.policy_pictures(policy, scene, found)
+    shown = [(picture.title, base64.b64decode(picture.png).decode()) for picture in pictures]
+    assert shown == [
+        ("100 s on the board: paper", "rollout_figure"),
+        ("100 s on the board: corner", "rollout_figure"),
+        ("Tilt distribution", "tilt_figure"),
+        ("Envelope", "envelope_figure"),
     ]
-    drawn = {picture.title: base64.b64decode(picture.png).decode() for picture in pictures}
-    assert list(drawn.values()) == [
-        "'rollout_figure'",
-        "'rollout_figure'",
-        "'tilt_figure'",
-        "'envelope_figure'",
-    ]
-    assert "suite corner (both axes at once" in pictures[1].caption
-    assert pictures[3].caption.startswith("Targets on both axes at once, 3 scenarios of 31 s per")
-    assert "3 mm five times a second turn the body at 4.46 deg/s" in pictures[3].caption
-    assert "the legs reach 10.3 deg. Inside, 75% of the cells" in pictures[3].caption
+    for suite, (_, given) in zip(("paper", "corner"), drawn, strict=False):
+        both = {n: (policy, suite, 100.0, 2_000_000, n) for n in ("policy", "pd-imu")}
+        assert given == (scene, both), "both on the same scenario"
+    shares, edges = drawn[2][1]
+    assert list(shares) == list(found.results)
+    np.testing.assert_array_equal(shares["none"], found.shares["none"]["paper"])
+    np.testing.assert_array_equal(edges, measuring.edges(6.0))
+    assert drawn[3][1] == (found.envelope, 6.0)
+    captions = [picture.caption for picture in pictures]
+    assert "suite paper (targets in any direction), beside the PD" in captions[0]
+    assert "suite corner (both axes at once" in captions[1]
+    assert captions[2].startswith("Suite paper, every physics step")
+    assert captions[3].startswith("Targets on both axes at once, 3 scenarios of 31 s per cell.")
+    assert "3 mm 5 times a second turn the body at 4.46 deg/s" in captions[3]
+    assert "the legs reach 10.3 deg. Inside, 75% of the cells" in captions[3]
+
+
+def test_the_video_is_of_a_scenario_that_was_measured(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple] = []
+
+    def recorded(*given: Any) -> Any:
+        asked.append(given)
+        return types.SimpleNamespace(qpos=np.arange(6.0).reshape(1, 3, 2))
+
+    def write(file: Path, config: Config, qpos: np.ndarray) -> None:
+        assert qpos.tolist() == [[0, 1], [2, 3], [4, 5]]
+        file.write_bytes(b"film")
+
+    monkeypatch.setattr(measuring, "recorded", recorded)
+    monkeypatch.setattr(page.render, "write", write)
+    policy = load_policy(run / "policy.safetensors")
+    assert base64.b64decode(page.video(policy)) == b"film"
+    assert asked == [(policy, "corner", 12.0, 4_000_000)]
+
+
+def test_the_first_run_that_has_a_policy_is_shown(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple] = []
+
+    def measured(policy: Policy, scene: Scene, *given: Any) -> Measured:
+        asked.append(given)
+        return made_up(policy)
+
+    def no_video(policy: Policy) -> str:
+        raise RenderError("no screen")
+
+    monkeypatch.setattr(measuring, "measured", measured)
+    monkeypatch.setattr(page, "policy_pictures", lambda *given: [])
+    monkeypatch.setattr(page, "video", no_video)
+    half = tmp_path / "half"
+    half.mkdir()
+    config = dataclasses.replace(preset("default"), seed=11, num_seeds=2)
+    (half / "config.json").write_text(json.dumps(to_dict(config)))
+    (half / "metrics.jsonl").write_text(json.dumps(metrics_line(4, 1)))
+    other = tmp_path / "other"
+    shutil.copytree(run, other)
+    out = tmp_path / "out.html"
+    missing = page.write_report([half, run, other], out, 7, print)
+    assert asked == [(run / "report.json", 7, print)]
+    assert "no video: no screen" in missing
+    assert f"{half / 'policy.safetensors'} is missing" in missing
+    text = out.read_text()
+    assert "<title>mjx_balance: half, run, other</title>" in text
+    assert "mjx-balance train --preset default --seed 11 --num-seeds 2" in text
+    seeds = Tables(text).found[1]
+    assert seeds[1][:3] == ["paper", "4", "4 of 32"], "two runs of two seeds, and one of none"
+    assert ["seed", "0", "11"] in Tables(text).found[2], "the first run's config"
 
 
 def test_the_seeds_of_alike_runs_are_put_together(config: Config) -> None:

@@ -60,12 +60,12 @@ def test_seeds_table() -> None:
 
 def test_the_summary_names_every_file_of_the_run() -> None:
     out = io.StringIO()
-    run = Path("runs/a")
+    run = Path("runs/a[b]")
     tables.print_summary(Console(width=80, file=out), run, {"corner": CORNER}, 61.6)
     text = out.getvalue()
     for name in ("policy.safetensors", "evaluation.json", "figures/", "metrics.jsonl"):
-        assert f"runs/a/{name}" in text
-    assert "runs/a/checkpoints/  the whole training state" in text
-    assert "`mjx-balance report runs/a` makes a page of it" in text
+        assert f"runs/a[b]/{name}" in text
+    assert "runs/a[b]/checkpoints/  the whole training state" in text
+    assert "`mjx-balance report runs/a[b]` makes a page of it" in text
     assert "0.068" in text
     assert text.endswith("done in 62 s\n")

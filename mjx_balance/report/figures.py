@@ -1,9 +1,10 @@
 """Figures of what was measured; nothing here simulates."""
 
+import functools
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib as mpl
 import numpy as np
@@ -32,6 +33,21 @@ STYLE: dict[Any, Any] = {
 }
 
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Lets a function draw in the package's style, whatever its caller's is."""
+
+    @functools.wraps(draw)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> R:
+        with plt.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return drawn
+
+
 def draw_figures(
     folder: Path,
     metrics: list[dict[str, Any]],
@@ -52,17 +68,17 @@ def draw_figures(
       The files written.
     """
     folder.mkdir(exist_ok=True)
-    with plt.rc_context(STYLE):
-        drawn = {
-            "learning_curves.png": learning_curves([metrics]),
-            "reward.png": reward_figure(task),
-            "rollout.png": rollout_figure(scene, rollouts),
-        }
-        for name, figure in drawn.items():
-            (folder / name).write_bytes(png(figure))
+    drawn = {
+        "learning_curves.png": learning_curves([metrics]),
+        "reward.png": reward_figure(task),
+        "rollout.png": rollout_figure(scene, rollouts),
+    }
+    for name, figure in drawn.items():
+        (folder / name).write_bytes(png(figure))
     return [folder / name for name in drawn]
 
 
+@styled
 def png(figure: plt.Figure) -> bytes:
     """A figure as the contents of a PNG file; the figure is closed."""
     buffer = io.BytesIO()
@@ -82,6 +98,7 @@ CURVES = (
 """Metric, title and scale of each panel of the learning curves."""
 
 
+@styled
 def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
     """Tilt, falls, reward, loss, epsilon and speed over the decisions.
 
@@ -128,6 +145,7 @@ def _seed_curves(run: list[dict[str, Any]], name: str) -> list[list[float]]:
     return [[m[name] for m in run]]
 
 
+@styled
 def reward_figure(task: TaskConfig) -> plt.Figure:
     """The paper's Fig. 4, the reward for the tilt, beside our reading of its Fig. 5."""
     tilt = np.linspace(0, task.fail_tilt, 301)
@@ -146,6 +164,7 @@ def reward_figure(task: TaskConfig) -> plt.Figure:
     return figure
 
 
+@styled
 def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
     """The paper's Fig. 7: board and body angles over time in plain MuJoCo.
 
@@ -193,6 +212,7 @@ def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
             axis.axvline(change, color="black", lw=0.8, ls=":")
 
 
+@styled
 def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figure:
     """How often the body is tilted further than so much.
 
@@ -215,6 +235,7 @@ def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figu
     return figure
 
 
+@styled
 def envelope_figure(envelope: Envelope, limit: float) -> plt.Figure:
     """Fall rate and mean tilt over incline and board speed, with the physical limits.
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_balance.config import to_dict
 from mjx_balance.controllers import CONTROLLERS, Controller, make_controller
 from mjx_balance.evaluation import (
     Envelope,
@@ -40,8 +41,8 @@ ENVELOPE_DURATION = 30.0
 RECORD_SECONDS = 100.0
 """As long as the paper's Fig. 7."""
 VIDEO_SECONDS = 12.0
-EDGES = np.concatenate(([0.0], np.geomspace(0.01, 6.0, 160), [6.0001]))
-"""Bins of the tilt distribution, deg."""
+BINS = 161
+"""Of the tilt distribution."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,9 +52,14 @@ class Measured:
     results: dict[str, dict[str, dict[str, Any]]]
     """Controller -> suite -> `reading.suite_result`."""
     shares: dict[str, dict[str, list[float]]]
-    """Controller -> suite -> share of the physics steps per bin of tilt between `EDGES`."""
+    """Controller -> suite -> (BINS,) share of the physics steps per bin of tilt (`edges`)."""
     envelope: Envelope
     """Of the policy."""
+
+
+def edges(fail_tilt: float) -> np.ndarray:
+    """(BINS + 1,) bounds of the tilt distribution, deg; a fall's tilt has the last bin."""
+    return np.concatenate(([0.0], np.geomspace(0.01, fail_tilt, BINS - 1), [fail_tilt + 1e-4]))
 
 
 def measured(
@@ -68,7 +74,7 @@ def measured(
       scenarios: per suite and controller.
       progress: title -> context manager that gives a callable taking the share done.
     """
-    key = [policy.fingerprint, scene.hash, code_digest()]
+    key = [policy.fingerprint, to_dict(policy.config), scene.hash, code_digest()]
     key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
     with contextlib.suppress(*FOREIGN):  # whatever else lies there, it is measured again
         saved = read_json(file)
@@ -96,9 +102,7 @@ def kept(saved: dict[str, Any]) -> Measured:
             for name in names
         },
         shares={
-            name: {
-                suite: _numbers(saved["shares"][name][suite], len(EDGES) - 1) for suite in HEADLINE
-            }
+            name: {suite: _numbers(saved["shares"][name][suite], BINS) for suite in HEADLINE}
             for name in names
         },
         envelope=Envelope(
@@ -144,7 +148,7 @@ def _measure(
                 )
             summary = summarize(rollout, suite, DURATION, SEEDS.report)
             results[name][suite] = suite_result(summary, suite)
-            counts, _ = np.histogram(rollout.tilt, EDGES)
+            counts, _ = np.histogram(rollout.tilt, edges(policy.config.task.fail_tilt))
             shares[name][suite] = (counts / counts.sum()).tolist()
     with progress("envelope") as bar:
         mapped = envelope(

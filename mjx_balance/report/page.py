@@ -12,8 +12,8 @@ import jinja2
 import numpy as np
 
 from mjx_balance import render
-from mjx_balance.config import Config, flatten, preset, to_dict
-from mjx_balance.evaluation import policy_scene
+from mjx_balance.config import Config, ConfigError, TaskConfig, flatten, preset, to_dict
+from mjx_balance.evaluation import SETTLED_SECONDS, Envelope, policy_scene
 from mjx_balance.policy import Policy, PolicyError
 from mjx_balance.report import figures, measuring
 from mjx_balance.report.measuring import Measured
@@ -80,7 +80,7 @@ def write_report(
     for run in [run for run in runs if run.policy is not None][:1]:
         try:
             shown |= _show_policy(run, runs, scenarios, progress, missing)
-        except PolicyError as error:
+        except (PolicyError, ConfigError) as error:
             missing.append(f"{run.path}: {error}")
     page = {
         "title": f"mjx_balance: {', '.join(run.path.name for run in runs)}",
@@ -141,12 +141,15 @@ def _show_policy(
 
 def comparison(policy: Policy, found: Measured) -> dict[str, Any]:
     """Headline figures, and the table of the policy against the baselines."""
-    ours = found.results["policy"]
+    task, ours = policy.config.task, found.results["policy"]
     count = ours["paper"]["scenarios"]
     falls = sum(ours[suite]["falls"] for suite in HEADLINE)
     tiles = [
         (f"{ours['paper']['tilt_deg']['mean']:.3f}°", "mean tilt, targets in any direction"),
-        (f"{ours['corner']['tilt_deg']['mean']:.3f}°", "mean tilt, both axes at 7° at once"),
+        (
+            f"{ours['corner']['tilt_deg']['mean']:.3f}°",
+            f"mean tilt, both axes at {task.max_incline:g}° at once",
+        ),
         (str(falls), f"falls in {len(HEADLINE) * count} scenarios of {measuring.DURATION:g} s"),
         (
             f"{100 * found.envelope.fall_free_share:.0f}%",
@@ -155,13 +158,15 @@ def comparison(policy: Policy, found: Measured) -> dict[str, Any]:
     ]
     sees = {"policy": f"this network: {policy.observation_size} inputs", **SEES}
     rows = [(name, sees[name], _baseline_cells(suites)) for name, suites in found.results.items()]
+    levels = task.action_levels
     note = (
         f"Plain MuJoCo, {count} held-out scenarios of {measuring.DURATION:g} s per suite (seed "
         f"{SEEDS.report}), tilt in degrees over every physics step; from a fall on it counts as "
-        "6°. All take the same 21 x 21 actions at 5 Hz. The last column is the mean height change "
-        "commanded per decision in the last 3 s of each period. The paper gives no figures; it "
-        "reports a high peak of the tilt when the board turns on both axes at once, and that its "
-        "controller cannot handle that."
+        f"{task.fail_tilt:g}°. All take the same {levels} x {levels} actions at "
+        f"{1 / task.ctrl_dt:g} Hz. The last column is the mean height change commanded per "
+        f"decision in the last {SETTLED_SECONDS:g} s of each period. The paper gives no figures; "
+        "it reports a high peak of the tilt when the board turns on both axes at once, and that "
+        "its controller cannot handle that."
     )
     return {"tiles": tiles, "suites": HEADLINE, "rows": rows, "note": note}
 
@@ -199,7 +204,7 @@ def seeds_table(shown: Run, runs: Sequence[Run]) -> dict[str, Any] | None:
 
 def policy_pictures(policy: Policy, scene: Scene, found: Measured) -> list[Picture]:
     """The paper's Fig. 7 for each suite, the distribution of the tilt, and the envelope."""
-    drawn = []
+    task, drawn = policy.config.task, []
     for suite in HEADLINE:
         both = {
             name: measuring.recorded(policy, suite, measuring.RECORD_SECONDS, SEEDS.record, name)
@@ -213,19 +218,22 @@ def policy_pictures(policy: Policy, scene: Scene, found: Measured) -> list[Pictu
             _picture(f"{measuring.RECORD_SECONDS:g} s on the board: {suite}", figure, caption)
         )
     shares = {name: np.asarray(suites["paper"]) for name, suites in found.shares.items()}
-    figure = figures.tilt_figure(shares, measuring.EDGES)
+    figure = figures.tilt_figure(shares, measuring.edges(task.fail_tilt))
     caption = "Suite paper, every physics step of every scenario."
     drawn.append(_picture("Tilt distribution", figure, caption))
-    mapped = found.envelope
-    caption = (
+    figure = figures.envelope_figure(found.envelope, task.fail_tilt)
+    return [*drawn, _picture("Envelope", figure, envelope_caption(task, found.envelope))]
+
+
+def envelope_caption(task: TaskConfig, mapped: Envelope) -> str:
+    """What the envelope's cells and its dashed line are."""
+    return (
         f"Targets on both axes at once, {mapped.scenarios} scenarios of {mapped.duration_s:g} s "
-        "per cell. Right of or above the dashed line the action set cannot follow: 3 mm five "
-        f"times a second turn the body at {mapped.authority:.2f} deg/s in pitch, and the legs "
-        f"reach {mapped.reach:.1f} deg. Inside, {100 * mapped.fall_free_share:.0f}% of the cells "
-        "are free of falls."
+        "per cell. Right of or above the dashed line the action set cannot follow: "
+        f"{1000 * task.action_max:g} mm {1 / task.ctrl_dt:g} times a second turn the body at "
+        f"{mapped.authority:.2f} deg/s in pitch, and the legs reach {mapped.reach:.1f} deg. "
+        f"Inside, {100 * mapped.fall_free_share:.0f}% of the cells are free of falls."
     )
-    figure = figures.envelope_figure(mapped, policy.config.task.fail_tilt)
-    return [*drawn, _picture("Envelope", figure, caption)]
 
 
 def video(policy: Policy) -> str:

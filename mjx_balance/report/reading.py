@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any
 
 from mjx_balance.config import Config, check, from_dict
@@ -79,7 +80,7 @@ def read_run(path: Path) -> Run:
             run.missing.append(f"{file} cannot be used: {why(error)}")
             return None
 
-    run.config = read(folder.config, lambda f: check(from_dict(Config, read_json(f))))
+    run.config = read(folder.config, lambda f: check(from_dict(Config, section(read_json(f)))))
     run.metrics = read(folder.metrics, lambda f: _read_metrics(f, run.missing)) or []
     run.policy = read(folder.policy, load_policy)
     own = read(folder.evaluation, lambda f: suite_results(read_json(f)))
@@ -96,9 +97,10 @@ def why(error: BaseException) -> str:
     if isinstance(error, RecursionError):
         return "it is nested too deep"
     reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-    reason = " ".join(reason.split()) or type(error).__name__
+    cut = len(reason) > SENTENCE
+    reason = " ".join(reason[:SENTENCE].split()) or type(error).__name__
     reason = "".join(letter if letter.isprintable() else "?" for letter in reason)
-    return reason if len(reason) <= SENTENCE else f"{reason[:SENTENCE]} ..."
+    return f"{reason} ..." if cut else reason
 
 
 def read_json(file: Path) -> Any:
@@ -129,36 +131,31 @@ def _parsed(text: bytes) -> Any:
 def section(value: Any, name: str = "it") -> dict[str, Any]:
     """Returns a JSON object; raises `ReportError` for anything else."""
     if not isinstance(value, dict):
-        raise ReportError(f"{name} is {_short(value)}; it must be a JSON object")
+        raise ReportError(f"{name} is {short(value)}; it must be a JSON object")
     return value
 
 
 def series(value: Any, name: str) -> list[Any]:
     """Returns a list; raises `ReportError` for anything else."""
     if not isinstance(value, list):
-        raise ReportError(f"{name} is {_short(value)}; it must be a list")
+        raise ReportError(f"{name} is {short(value)}; it must be a list")
     return value
 
 
 def number(value: Any, name: str) -> float:
     """Returns a finite number; raises `ReportError` for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ReportError(f"{name} is {_short(value)}; it must be a number")
+        raise ReportError(f"{name} is {short(value)}; it must be a number")
     if not abs(value) <= GREATEST:
-        raise ReportError(f"{name} is {_short(value)}; it must be finite and at most {GREATEST:g}")
+        raise ReportError(f"{name} is {short(value)}; it must be finite and at most {GREATEST:g}")
     return float(value)
 
 
 def count(value: Any, name: str) -> int:
     """Returns a whole number; raises `ReportError` for anything else."""
     if type(value) is not int or not 0 <= value <= GREATEST:
-        raise ReportError(f"{name} is {_short(value)}; it must be a whole number of at least 0")
+        raise ReportError(f"{name} is {short(value)}; it must be a whole number of at least 0")
     return value
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else f"{text[:40]}..."
 
 
 def suite_results(value: Any) -> dict[str, dict[str, Any]]:

@@ -5,6 +5,7 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from mjx_balance.run_folder import RunFolder
@@ -67,8 +68,10 @@ def print_summary(
         (folder.metrics, f"every logged number; {folder.tensorboard.name}/ has them too"),
         (f"{folder.checkpoints}/", "the whole training state"),
     ):
-        console.print(f"{path}  [dim]{what}[/dim]", highlight=False, soft_wrap=True)
-    console.print(f"`mjx-balance report {run_dir}` makes a page of it", highlight=False)
+        console.print(f"{escape(str(path))}  [dim]{what}[/dim]", highlight=False, soft_wrap=True)
+    console.print(
+        f"`mjx-balance report {run_dir}` makes a page of it", highlight=False, markup=False
+    )
     console.print(f"done in {seconds:.0f} s", highlight=False)
 
 
