@@ -250,6 +250,14 @@ def test_robot_that_does_not_come_to_rest_is_refused(
         load_scene(with_task(config, sim_dt=0.02))
 
 
+def test_robot_that_still_moves_is_refused(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Upright, but looked at after 40 ms, while it sinks into its servos."""
+    monkeypatch.setattr("mjx_balance.scene.SETTLE_STEPS", 5)
+    monkeypatch.setattr("mjx_balance.scene.SETTLE_ROUNDS", 1)
+    with pytest.raises(ConfigError, match="does not stand still"):
+        load_scene(config)
+
+
 def test_robot_keeps_standing_on_the_level_board(scene: Scene) -> None:
     """10 s: it neither sinks nor creeps."""
     data = standing(scene)
