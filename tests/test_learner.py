@@ -1,7 +1,6 @@
 """The DQN on environments with known values, on two devices."""
 
 import dataclasses
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,6 @@ from mjx_balance.dqn import whitening
 from mjx_balance.dqn.learner import Learner, TrainState, dither, epsilon, mirrored
 from mjx_balance.dqn.networks import QNetwork, fold_inputs
 from mjx_balance.dqn.replay import Transition
-from mjx_balance.training.checkpoints import CheckpointError, Checkpoints
 
 CONFIG = DQNConfig(
     gamma=0.5,
@@ -218,26 +216,6 @@ def test_epsilon_falls_linearly_and_stays() -> None:
     )
     got = [float(epsilon(config, jnp.int32(n))) for n in (0, 50, 100, 1_000)]
     np.testing.assert_allclose(got, (1.0, 0.6, 0.2, 0.2), rtol=1e-6)
-
-
-def test_a_restored_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    learner = make(probes.NoisyState())
-    program = learner.train_program(10)
-    state, _ = program(learner.init(0))
-    checkpoints = Checkpoints(tmp_path / "checkpoints")
-    checkpoints.save(int(state.env_steps), state)
-    uninterrupted, _ = program(state)
-    resumed, _ = program(Checkpoints(tmp_path / "checkpoints").restore(learner.init(7)))
-    jax.tree.map(
-        lambda a, b: np.testing.assert_array_equal(jax.device_get(a), jax.device_get(b)),
-        resumed,
-        uninterrupted,
-    )
-
-
-def test_nothing_to_restore_is_said(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no checkpoint"):
-        Checkpoints(tmp_path / "checkpoints").restore({})
 
 
 @pytest.mark.parametrize(("name", "changes"), [("batch_size", {"batch_size": 33})])

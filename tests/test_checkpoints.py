@@ -1,0 +1,157 @@
+"""Checkpoints: what was saved comes back, and what is damaged is found out."""
+
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from hypothesis import given, settings
+
+from mjx_balance.config import DQNConfig
+from mjx_balance.dqn.learner import Learner
+from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.training.checkpoints import CheckpointError, restore, save, saved_steps
+
+
+class State(NamedTuple):
+    weights: dict[str, jax.Array]
+    number: jax.Array
+
+
+def state_of(number: int) -> State:
+    return State({"kernel": jnp.full((3, 4), number, jnp.float32)}, jnp.int32(number))
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoints after 5 and 10 decisions; copy before touching."""
+    folder = tmp_path_factory.mktemp("two")
+    save(folder, 5, state_of(5))
+    save(folder, 10, state_of(10))
+    return folder
+
+
+@pytest.fixture
+def folder(two: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(two, tmp_path / "checkpoints")
+
+
+def restored(folder: Path, said: list[str] | None = None) -> int:
+    """What is in the newest whole checkpoint."""
+    state = restore(folder, state_of(0), (said if said is not None else []).append)
+    assert state is not None
+    np.testing.assert_array_equal(state.weights["kernel"], np.full((3, 4), state.number))
+    return int(state.number)
+
+
+def test_the_newest_comes_back_and_the_oldest_goes(folder: Path) -> None:
+    assert restored(folder) == 10
+    save(folder, 100, state_of(100))  # 100 comes after 10, though not in the alphabet's order
+    assert saved_steps(folder) == [10, 100]
+    assert restored(folder) == 100
+    assert sorted(path.name for path in folder.iterdir()) == ["10", "100"]
+
+
+def test_what_is_there_is_not_written_again(folder: Path) -> None:
+    save(folder, 10, state_of(11))
+    assert restored(folder) == 10
+
+
+def test_nothing_was_ever_saved(tmp_path: Path) -> None:
+    assert restore(tmp_path / "checkpoints", state_of(0), pytest.fail) is None
+    (tmp_path / "7.part").mkdir()
+    (tmp_path / "notes").mkdir()
+    assert restore(tmp_path, state_of(0), pytest.fail) is None
+
+
+def test_a_killed_save_leaves_the_one_before(folder: Path) -> None:
+    shutil.copytree(folder / "10", folder / "20.part")
+    (folder / "20.part" / "sum").unlink()
+    assert restored(folder) == 10
+    save(folder, 20, state_of(20))
+    assert restored(folder) == 20
+    assert not (folder / "20.part").exists()
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(folder: Path) -> None:
+    (folder / "10" / "sum").write_text("0")
+    said: list[str] = []
+    assert restored(folder, said) == 5
+    assert said == [f"the checkpoint {folder / '10'} is damaged; trying the one before"]
+    assert saved_steps(folder) == [5]  # the run will come by 10 again
+    save(folder, 10, state_of(12))
+    assert restored(folder) == 12
+
+
+def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").write_text("no folder")
+    with pytest.raises(CheckpointError, match=r"checkpoints/5 cannot be written: .*Not a dir"):
+        save(tmp_path / "checkpoints", 5, state_of(5))
+
+
+def test_none_is_whole(folder: Path) -> None:
+    for name in ("5", "10"):
+        shutil.rmtree(folder / name / "state")
+    said: list[str] = []
+    with pytest.raises(CheckpointError, match="is whole; start a new run with --run-dir"):
+        restore(folder, state_of(0), said.append)
+    assert len(said) == 2
+    assert saved_steps(folder) == [5, 10]  # nothing is thrown away then
+
+
+@pytest.mark.parametrize("other", [State({}, jnp.int32(0)), {"a": jnp.zeros(2)}])
+def test_another_structure_is_refused(folder: Path, other: object) -> None:
+    with pytest.raises(CheckpointError, match="is whole"):
+        restore(folder, other, lambda said: None)
+
+
+@settings(deadline=None, max_examples=60)
+@given(data=st.data())
+def test_any_damage_is_found_out(
+    data: st.DataObject, two: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """A byte changed, a file cut, removed, added or renamed, anywhere."""
+    folder = tmp_path_factory.mktemp("damaged")
+    shutil.copytree(two, folder, dirs_exist_ok=True)
+    files = sorted(path for path in (folder / "10").rglob("*") if path.is_file())
+    file = data.draw(st.sampled_from(files))
+    content = file.read_bytes()
+    kind = data.draw(st.sampled_from(("flip", "cut", "remove", "add", "rename", "garbage")))
+    if kind == "flip" and content:
+        at, mask = data.draw(st.integers(0, len(content) - 1)), data.draw(st.integers(1, 255))
+        file.write_bytes(content[:at] + bytes([content[at] ^ mask]) + content[at + 1 :])
+    elif kind == "cut" and content:
+        file.write_bytes(content[: data.draw(st.integers(0, len(content) - 1))])
+    elif kind == "garbage" or (kind == "add" and file.name == "sum"):
+        file.write_bytes(content + data.draw(st.binary(min_size=1, max_size=20)))
+    elif kind == "add":
+        file.with_name("more").write_bytes(b"")
+    elif kind == "rename":
+        file.rename(file.with_name("other"))
+    else:
+        file.unlink()
+    assert restored(folder) == 5
+
+
+def test_a_restored_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    """With everything a run is made of, spread over two devices."""
+    config = DQNConfig(batch_size=32, replay_capacity=512, min_replay_size=16)
+    learner = Learner(probes.NoisyState(), QNetwork((16,), (2,)), config, 8, 800)
+    assert learner.num_devices == 2
+    program = learner.train_program(10)
+    state, _ = program(learner.init(0))
+    save(tmp_path, int(state.env_steps), state)
+    uninterrupted, _ = program(state)
+    saved = restore(tmp_path, learner.init(7), pytest.fail)
+    assert saved is not None
+    resumed, _ = program(saved)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_array_equal(jax.device_get(a), jax.device_get(b)),
+        resumed,
+        uninterrupted,
+    )
