@@ -259,8 +259,8 @@ class Config:
     """JAX devices to spread the boards over; none: one per CPU core, or all accelerators."""
     log_every: int = 2_048
     """Env steps between two lines of metrics."""
-    checkpoint_every: int = 100_000
-    """Env steps between two checkpoints."""
+    checkpoint_seconds: float = 45.0
+    """Time between two checkpoints, s."""
     eval_scenarios: int = 128
     """Scenarios per suite of the evaluation after training."""
     eval_duration: float = 60.0
@@ -446,7 +446,7 @@ _POSITIVE = frozenset(
     "gyro_scale accel_scale reward_toward_scale episode_length learning_rate batch_size "
     "updates_per_step replay_capacity min_replay_size target_update_period epsilon_decay_steps "
     "max_grad_norm whiten_floor imu_mean num_envs num_seeds num_env_steps num_devices log_every "
-    "checkpoint_every eval_scenarios eval_duration friction_min friction_max foot_friction "
+    "checkpoint_seconds eval_scenarios eval_duration friction_min friction_max foot_friction "
     "servo_stiffness hip_x hip_y thigh calf foot_radius".split()
 )
 _NOT_NEGATIVE = frozenset(
