@@ -8,7 +8,7 @@ comma := ,
 RUNTIME := $(VENV)/.installed-$(EXTRAS)
 DEV := $(VENV)/.installed-dev-$(EXTRAS)
 
-.PHONY: train test check bench format clean
+.PHONY: train test check bench bugs format clean
 
 train: $(RUNTIME)
 	$(BIN)/python train.py $(ARGS)
@@ -23,6 +23,9 @@ check: $(DEV)
 
 bench: $(RUNTIME)
 	$(BIN)/python benchmarks/throughput.py $(ARGS)
+
+bugs: $(DEV)
+	$(BIN)/python tests/planted/run.py $(ARGS)
 
 format: $(DEV)
 	$(BIN)/ruff check --fix .

@@ -21,6 +21,7 @@ import numpy as np
 from markers import publish, table
 
 from mjx_balance.config import preset
+from mjx_balance.suites import HEADLINE
 
 
 def lags(samples: Iterable[int], commands: str) -> str:
@@ -33,12 +34,12 @@ VARIANTS = {
     "default": {
         "as it is": "",
         "no whitening": "--whiten-steps 0",
-        "no dither": "--dither 0",
+        "no exploration noise": "--exploration-noise 0",
         "no mirror": "--no-mirror",
         "head: factored, 21 + 21 outputs": "--head factored",
         "head: joint, 441 outputs (paper)": "--head joint",
         "reward for the tilt at the end": "--reward-tilt end",
-        "8 updates per decision of all boards": "--updates-per-step 8",
+        "8 updates per decision of all boards": "--replay-ratio 16",
         "learning rate 1e-3": "--learning-rate 1e-3",
         "Double DQN": "--double",
         "gamma 0.4": "--gamma 0.4",
@@ -93,7 +94,7 @@ def rows_of(name: str, args: argparse.Namespace) -> list[list[str]]:
         if not found:
             continue
         cells = [title, str(len(found))]
-        for suite in ("paper", "corner"):
+        for suite in HEADLINE:
             tilts = [result[suite]["tilt_deg"] for result in found]
             cells.append(str(sum(result[suite]["falls"] for result in found)))
             cells += [f"{np.mean([tilt[key] for tilt in tilts]):.3f}" for key in ("mean", "p95")]
@@ -114,7 +115,7 @@ def main() -> None:
     lines = []
     for name in args.presets:
         columns = [f"preset `{name}`", "seeds"]
-        for suite in ("paper", "corner"):
+        for suite in HEADLINE:
             columns += [f"`{suite}`: falls", "mean", "p95", "max"]
         lines += [*table(columns, rows_of(name, args)), ""]
         lines += [

@@ -2,7 +2,7 @@
 
 Coordinate search: each parameter in turn is set to the best of a few values, until a
 round changes nothing. The score is the mean tilt over a suite, falls counting as 6 deg.
-The winners for suite `paper` are the defaults in `mjx_balance/baselines.py`; `--suite
+The winners for suite `paper` are the defaults in `mjx_balance/controllers.py`; `--suite
 latency` shows what the same controllers reach if they are tuned for late actions instead.
 
     python benchmarks/baselines.py [--scenarios 16] [--duration 40] [--suite paper]
@@ -20,12 +20,12 @@ from pathlib import Path
 
 from markers import publish, table
 
-from mjx_balance.baselines import AttitudePD, ImuPD, make_controller
 from mjx_balance.config import preset
+from mjx_balance.controllers import AttitudePD, ImuPD, make_controller
 from mjx_balance.evaluation import run_suite, summarize
 from mjx_balance.scene import load_scene
+from mjx_balance.suites import HEADLINE, SEEDS
 
-TRAINING_SEED, HELD_OUT_SEED = 5_000_000, 7_000_000
 GRIDS: Mapping[type, Mapping[str, Sequence[float]]] = {
     AttitudePD: {
         "proportional": (0.2, 0.4, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6),
@@ -60,7 +60,7 @@ def tune(scenarios: int, duration: float, suite: str) -> None:
         def score(trial: Mapping[str, float], mean=mean, scores=scores) -> float:
             key = tuple(trial.values())
             if key not in scores:
-                scores[key] = mean(trial, TRAINING_SEED)
+                scores[key] = mean(trial, SEEDS.tuning)
             return scores[key]
 
         while True:
@@ -71,7 +71,7 @@ def tune(scenarios: int, duration: float, suite: str) -> None:
             print(f"{kind.__name__}: {chosen} -> {score(chosen):.4f} deg", flush=True)
             if chosen == before:
                 break
-        held_out = mean(chosen, HELD_OUT_SEED)
+        held_out = mean(chosen, SEEDS.held_out)
         print(f"{kind.__name__}: best of {len(scores)}; held out {held_out:.4f} deg", flush=True)
 
 
@@ -85,15 +85,15 @@ def leg_timing(scenarios: int, duration: float, page: Path) -> None:
         scene = load_scene(config)
         cells = [f"{ramp:.0%}" + (" (as shipped)" if task == default.task else "")]
         for name in TIMED:
-            for suite in ("paper", "corner"):
+            for suite in HEADLINE:
                 controller = make_controller(name, scene, config)
                 rollout = run_suite(
-                    scene, config, controller, suite, scenarios, duration, HELD_OUT_SEED
+                    scene, config, controller, suite, scenarios, duration, SEEDS.held_out
                 )
-                tilt = summarize(rollout, suite, duration, HELD_OUT_SEED)["tilt_deg"]
+                tilt = summarize(rollout, suite, duration, SEEDS.held_out)["tilt_deg"]
                 cells.append(" / ".join(f"{tilt[x]:.3f}" for x in ("mean", "p95", "max")))
         rows.append(cells)
-    columns = [f"`{name}`, `{suite}`" for name in TIMED for suite in ("paper", "corner")]
+    columns = [f"`{name}`, `{suite}`" for name in TIMED for suite in HEADLINE]
     note = f"{scenarios} held-out scenarios of {duration:g} s; mean / p95 / max tilt in deg."
     publish("baselines", [*table(["legs move for", *columns], rows), "", note], page)
 

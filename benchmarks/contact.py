@@ -14,14 +14,11 @@ import mujoco
 import numpy as np
 
 from mjx_balance import evaluation, load_policy
-from mjx_balance.plant import View
+from mjx_balance.config import Config
+from mjx_balance.controllers import Controller, View
 from mjx_balance.policy import Policy
-from mjx_balance.quiet import quiet_imports
 from mjx_balance.scene import Scene
 from mjx_balance.suites import make_scenarios
-
-with quiet_imports():
-    from mjx_balance.physics import LINE_SEARCH_ITERATIONS
 
 PYRAMIDAL = {"cone": float(mujoco.mjtCone.mjCONE_PYRAMIDAL)}
 VARIANTS: dict[str, dict[str, float]] = {
@@ -43,7 +40,7 @@ def varied(scene: Scene, changes: dict[str, float]) -> Scene:
     changed = copy.copy(scene.model)
     if "iterations" in changes:
         changed.opt.iterations = int(changes["iterations"])
-        changed.opt.ls_iterations = LINE_SEARCH_ITERATIONS
+        changed.opt.ls_iterations = Config.line_search_iterations
     if "cone" in changes:
         changed.opt.cone = int(changes["cone"])
     if "friction" in changes:
@@ -55,7 +52,7 @@ def varied(scene: Scene, changes: dict[str, float]) -> Scene:
     return dataclasses.replace(scene, model=changed)
 
 
-def exploring(policy: Policy, share: float, seed: int) -> evaluation.Controller:
+def exploring(policy: Policy, share: float, seed: int) -> Controller:
     """The policy, with a share of its actions random."""
     rng = np.random.default_rng(seed)
 

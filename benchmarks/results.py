@@ -1,8 +1,10 @@
 """Measures policies and baselines on every suite and writes the README's tables.
 
-Every evaluation is kept in `--out` as soon as it is done, under the fingerprint of the
-policy or of the baselines' source, so that an interrupted run goes on where it stopped.
-`--write` puts the tables between the markers of a Markdown file.
+Every evaluation is kept in `--out` as soon as it is done, with the digest of the code and
+the scene that gave it, so that an interrupted run goes on where it stopped. A result that
+other code gave stands if its first scenarios give the same mean tilt again, to the last
+bit; otherwise it is measured again. `--write` puts the tables between the markers of a
+Markdown file.
 
     python benchmarks/results.py policies/seeds/*.safetensors --write README.md
 """
@@ -18,7 +20,7 @@ from markers import publish, table
 from rich.console import Console
 
 from mjx_balance import load_policy
-from mjx_balance.baselines import CONTROLLERS, make_controller
+from mjx_balance.controllers import CONTROLLERS, make_controller
 from mjx_balance.display import Display
 from mjx_balance.evaluation import (
     Controller,
@@ -30,27 +32,43 @@ from mjx_balance.evaluation import (
     summarize,
 )
 from mjx_balance.policy import Policy
-from mjx_balance.report import ENVELOPE_DURATION, ENVELOPE_SCENARIOS, baselines_digest
+from mjx_balance.report.digest import code_digest
+from mjx_balance.report.measuring import ENVELOPE_DURATION, ENVELOPE_SCENARIOS
 from mjx_balance.statistics import TILTS, over_seeds
-from mjx_balance.suites import SUITES
+from mjx_balance.suites import HEADLINE, SEEDS, SUITES
 
-SEED = 7_000_000
 DURATION = 60.0
-MAIN = ("paper", "corner")
 BOARDS = ("fast", "steep")
 
 
 def measured(
-    out: Path, key: str, title: str, measure: Callable[[Any], dict[str, Any]]
+    out: Path,
+    key: str,
+    stamp: str,
+    title: str,
+    measure: Callable[[Any], dict[str, Any]],
+    same: Callable[[dict[str, Any], Any], bool] = lambda kept, bar: False,
 ) -> dict[str, Any]:
-    """Reads a result from `out`, or measures it and adds it there."""
+    """Reads a result from `out`, or measures it and keeps it there.
+
+    Args:
+      out: JSON file.
+      key: of the result: who, and on what.
+      stamp: of the code and scene that would measure it now.
+      title: of the progress bar.
+      measure: takes a progress bar.
+      same: whether a result with another stamp holds all the same; takes it and a bar.
+    """
     known = json.loads(out.read_text()) if out.is_file() else {}
-    if key not in known:
-        with Display(Console(stderr=True)).bar(title) as bar:
-            known[key] = measure(bar)
-        part = out.with_suffix(".part")
-        part.write_text(json.dumps(known, indent=1) + "\n")
-        part.replace(out)
+    kept = known.get(key)
+    if kept is not None and kept.get("code") == stamp:
+        return kept
+    with Display(Console(stderr=True)).bar(title) as bar:
+        found = kept if kept is not None and same(kept, bar) else measure(bar)
+    known[key] = found | {"code": stamp}
+    part = out.with_suffix(".part")
+    part.write_text(json.dumps(known, indent=1) + "\n")
+    part.replace(out)
     return known[key]
 
 
@@ -64,17 +82,23 @@ def suite_result(
     parts: tuple[int, ...],
 ) -> dict[str, Any]:
     """Evaluates one controller on one suite; `mean_of_first` has its mean tilt over `parts`."""
+    scene, config = policy_scene(policy), policy.config
 
-    def measure(bar: Any) -> dict[str, Any]:
-        scene = policy_scene(policy)
-        rollout = run_suite(scene, policy.config, make(), suite, scenarios, DURATION, SEED, bar)
-        firsts = {str(n): float(rollout.tilt[:n].mean()) for n in parts if n <= scenarios}
-        return summarize(rollout, suite, DURATION, SEED) | {"mean_of_first": firsts}
+    def measure(bar: Any, count: int = scenarios) -> dict[str, Any]:
+        rollout = run_suite(scene, config, make(), suite, count, DURATION, SEEDS.held_out, bar)
+        firsts = {str(n): float(rollout.tilt[:n].mean()) for n in parts if n <= count}
+        return summarize(rollout, suite, DURATION, SEEDS.held_out) | {"mean_of_first": firsts}
 
-    ramp = policy.config.task.action_ramp
-    key = f"{name}, scene {policy.scene_hash}, ramp {ramp}, {suite}, {scenarios} x {DURATION:g} s"
-    key += f", seed {SEED}"
-    return measured(out, key, f"{name}, {suite}, {scenarios} scenarios", measure)
+    def same(kept: dict[str, Any], bar: Any) -> bool:
+        few = min(parts)
+        if few >= scenarios:
+            return False
+        return measure(bar, few)["mean_of_first"] == {str(few): kept["mean_of_first"][str(few)]}
+
+    key = f"{name}, ramp {config.task.action_ramp}, {suite}, {scenarios} x {DURATION:g} s, seed "
+    key += str(SEEDS.held_out)
+    stamp = f"{code_digest()}, scene {scene.hash}"
+    return measured(out, key, stamp, f"{name}, {suite}, {scenarios} scenarios", measure, same)
 
 
 def suite_table(
@@ -121,7 +145,7 @@ def main() -> None:
     baselines: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in CONTROLLERS}
     for suite in SUITES:
         usual = args.rest if suite in BOARDS else args.others
-        count = args.scenarios if suite in MAIN else usual
+        count = args.scenarios if suite in HEADLINE else usual
         networks[suite] = [
             suite_result(
                 args.out,
@@ -137,7 +161,7 @@ def main() -> None:
         for name in CONTROLLERS:
             baselines[name][suite] = suite_result(
                 args.out,
-                f"{name} {baselines_digest()}",
+                name,
                 first,
                 lambda name=name: make_controller(name, scene, config),
                 suite,
@@ -149,13 +173,22 @@ def main() -> None:
 
         def measure(bar: Any, policy: Policy = policy) -> dict[str, Any]:
             found = envelope(
-                scene, config, observing(policy), ENVELOPE_SCENARIOS, ENVELOPE_DURATION, SEED, bar
+                scene,
+                config,
+                observing(policy),
+                ENVELOPE_SCENARIOS,
+                ENVELOPE_DURATION,
+                SEEDS.held_out,
+                bar,
             )
             return vars(found)
 
-        key = f"envelope of policy {policy.fingerprint}, scene {scene.hash}, "
-        key += f"{ENVELOPE_SCENARIOS} x {ENVELOPE_DURATION:g} s, seed {SEED}"
-        shares.append(Envelope(**measured(args.out, key, "envelope", measure)).fall_free_share)
+        key = f"envelope of policy {policy.fingerprint}, "
+        key += f"{ENVELOPE_SCENARIOS} x {ENVELOPE_DURATION:g} s, seed {SEEDS.held_out}"
+        stamp = f"{code_digest()}, scene {scene.hash}"
+        kept = measured(args.out, key, stamp, "envelope", measure)
+        fields = {name: value for name, value in kept.items() if name != "code"}
+        shares.append(Envelope(**fields).fall_free_share)
     settled = max(r["action_mm_settled"] for results in networks.values() for r in results)
     note = (
         f"{len(policies)} training seeds (interquartile mean, 95% bootstrap interval), scenarios "

@@ -70,7 +70,7 @@ def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
     return {
         "num_envs": num_envs,
         "preset": preset_name,
-        "updates_per_step": config.dqn.updates_per_step,
+        "updates_per_step": config.dqn.updates_per_step(num_envs),
         "device": f"{len(jax.devices())} x {device.device_kind}",
         "devices_used": config.num_devices,
         "physics_steps_per_second": rate,
@@ -88,13 +88,16 @@ def _random_program(learner, iterations: int) -> Callable[..., Any]:
     import jax
     import jax.numpy as jnp
 
-    from mjx_balance.dqn.learner import AXIS, REPLICATED
+    from mjx_balance.dqn.collecting import reset_done
+    from mjx_balance.dqn.devices import device_key
+    from mjx_balance.dqn.learner import REPLICATED
+
+    env = learner.env
 
     def step(state, key):
-        key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
-        count = state.reward.shape[0]
-        action = jax.random.randint(key, (count,), 0, learner.env.action_size)
-        return learner.reset_done(jax.vmap(learner.env.step)(state, action), key), None
+        key_act, key_reset = jax.random.split(device_key(key))
+        action = jax.random.randint(key_act, state.reward.shape, 0, env.action_size)
+        return reset_done(env.reset, jax.vmap(env.step)(state, action), key_reset), None
 
     def program(state, key):
         state, _ = jax.lax.scan(step, state, jax.random.split(key, iterations))
@@ -126,18 +129,19 @@ def _peer(env, num_envs: int) -> tuple[Callable[[], Any], int]:
     import numpy as np
     from mujoco.batch import Batch
 
-    from mjx_balance.plant import decision_ctrl, standing_heights
-    from mjx_balance.task.actions import action_table, apply_action
+    from mjx_balance.task import decision
+    from mjx_balance.task.actions import action_table
     from mjx_balance.task.tilt import Scenario
 
     config, scene = env.config, env.scene
-    rng = np.random.default_rng(0)
-    before = np.tile(standing_heights(config), (num_envs, 1))
-    change = action_table(config.task)[rng.integers(env.action_size, size=num_envs)]
-    after = apply_action(config.task, config.robot, before, change)
+    task, rng = config.task, np.random.default_rng(0)
+    memory = decision.start(task, scene.robot, np.tile(scene.stance.imu, (num_envs, 1)))
+    change = action_table(task)[rng.integers(env.action_size, size=num_envs)]
     targets = rng.uniform(-5, 5, (num_envs, 2, 2))
-    scenario = Scenario(targets, np.zeros(num_envs), np.full(num_envs, config.task.board_rate))
-    ctrl = decision_ctrl(config, scene, scenario, np.zeros(num_envs), before, after)
+    scenario = Scenario(targets, np.zeros(num_envs), np.full(num_envs, task.board_rate))
+    now = np.zeros(num_envs)
+    _, wanted = decision.controls(task, scene.robot, memory, change, None, scenario, now)
+    ctrl = scene.ctrl(wanted)
     batch = Batch(scene.model, num_envs, os.cpu_count() or 1)
     repeats = max(1, DECISIONS_PER_CALL // num_envs)
 

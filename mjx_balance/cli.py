@@ -96,13 +96,14 @@ def _train(argv: list[str]) -> int:
         return _complain("--resume continues a folder in place; leave --run-dir out")
 
     with quiet_imports():
-        from mjx_balance import training
+        from mjx_balance.training import run
     from mjx_balance.display import Display
+    from mjx_balance.training.checkpoints import CheckpointError
 
     display = Display()
     try:
-        training.train(parsed.config, parsed.run_dir, parsed.resume, display)
-    except (ConfigError, RunFolderError, training.CheckpointError) as error:
+        run.train(parsed.config, parsed.run_dir, parsed.resume, display)
+    except (ConfigError, RunFolderError, CheckpointError) as error:
         return _complain(str(error))
     except PolicyError as error:
         _complain(str(error))
@@ -110,7 +111,7 @@ def _train(argv: list[str]) -> int:
     except OSError as error:  # a full disk: what is saved stays, and can be resumed
         _complain(f"cannot write {error.filename or 'the run'}: {error.strerror}")
         return FAILED
-    except training.Interrupted as stopped:
+    except run.Interrupted as stopped:
         display.say(str(stopped))
         return INTERRUPTED
     except KeyboardInterrupt:
@@ -120,9 +121,10 @@ def _train(argv: list[str]) -> int:
 
 def _evaluate(argv: list[str]) -> int:
     args = tyro.cli(EvaluateArgs, args=argv, prog="mjx-balance evaluate")
-    from mjx_balance import evaluation, report
-    from mjx_balance.baselines import ControllerError, make_controller
+    from mjx_balance import evaluation
+    from mjx_balance.controllers import ControllerError, make_controller
     from mjx_balance.display import Display
+    from mjx_balance.report.tables import evaluation_table
     from mjx_balance.scene import load_scene
     from mjx_balance.suites import SuiteError
 
@@ -158,7 +160,7 @@ def _evaluate(argv: list[str]) -> int:
         result = evaluation.summarize(rollout, args.suite, args.duration, args.seed)
         if args.json:
             args.json.write_text(json.dumps(result, indent=2) + "\n")
-        Console().print(report.evaluation_table({args.suite: result}))
+        Console().print(evaluation_table({args.suite: result}))
         speed = result["physics_steps_per_second"]
         print(f"{speed:,.0f} physics steps per second")
         if args.video:
@@ -191,17 +193,18 @@ def _video(scene, config: Config, controller, args: EvaluateArgs) -> int:
 
 def _report(argv: list[str]) -> int:
     args = tyro.cli(ReportArgs, args=argv, prog="mjx-balance report")
-    from mjx_balance import report
     from mjx_balance.display import Display
     from mjx_balance.evaluation import EvaluationError
+    from mjx_balance.report.page import write_report
+    from mjx_balance.report.reading import ReportError
 
     if not args.run_dirs:
         return _complain("name at least one run folder")
     out = args.out or args.run_dirs[0] / "report.html"
     display = Display(Console(stderr=True))
     try:
-        missing = report.write_report(args.run_dirs, out, args.scenarios, display.bar)
-    except (report.ReportError, EvaluationError) as error:
+        missing = write_report(args.run_dirs, out, args.scenarios, display.bar)
+    except (ReportError, EvaluationError) as error:
         return _complain(str(error))
     except OSError as error:
         return _complain(f"cannot write {error.filename}: {error.strerror}")

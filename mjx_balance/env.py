@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
-from mjx_balance import physics
-from mjx_balance.config import ACTION_AXES, Config, RandomConfig, check, preset
-from mjx_balance.plant import decision_ctrl, observation, standing_heights
-from mjx_balance.scene import Scene, load_scene, model_fields
-from mjx_balance.task import tilt
-from mjx_balance.task.actions import action_table, apply_action
-from mjx_balance.task.conditions import DRAWS, draw_conditions
-from mjx_balance.task.observation import extend_history, observation_names
-from mjx_balance.task.reward import failed, reward_terms
+from mjx_balance.config import ACTION_AXES, Config, RandomizationConfig, check, preset
+from mjx_balance.engines.mjx import Engine, mjx_engine
+from mjx_balance.model_fields import model_fields
+from mjx_balance.scene import Scene, load_scene
+from mjx_balance.task import decision, tilt
+from mjx_balance.task.actions import action_table
+from mjx_balance.task.observation import observation_names
+from mjx_balance.task.randomization import DRAWS, draw_conditions
+from mjx_balance.task.reward import REWARDS
 from mjx_balance.task.symmetry import Symmetries, symmetries
 
 
@@ -42,15 +42,15 @@ class BalanceEnv(Env):
         self.config = check(config or preset("default"))
         self.scene: Scene = load_scene(self.config)
         self._table = action_table(self.config.task)
-        self._randomised = self.config.random != RandomConfig()
+        self._randomised = self.config.randomization != RandomizationConfig()
 
     @functools.cached_property
-    def _advance(self) -> physics.Advance:
-        return physics.mjx_advance(self.scene)
+    def _engine(self) -> Engine:
+        return mjx_engine(self.scene, self.config)
 
     @property
     def observation_size(self) -> int:
-        return len(observation_names(self.config.task, self.config.robot))
+        return len(observation_names(self.config.task, self.scene.robot))
 
     @property
     def action_size(self) -> int:
@@ -65,7 +65,7 @@ class BalanceEnv(Env):
     @property
     def symmetries(self) -> Symmetries:
         """How observations and actions look in a mirror."""
-        return symmetries(self.config.task, self.config.robot)
+        return symmetries(self.config.task, self.scene.robot)
 
     @property
     def backend(self) -> str:
@@ -80,34 +80,41 @@ class BalanceEnv(Env):
         Returns:
           State with obs (obs_size,).
         """
-        task = self.config.task
+        task, robot = self.config.task, self.scene.robot
         rng, key_conditions, key_noise = jax.random.split(rng, 3)
-        state = physics.initial_state(self.scene)
-        still = jnp.asarray(self.scene.stance.imu, jnp.float32)
-        stand = jnp.asarray(standing_heights(self.config), jnp.float32)
-        commanded = jnp.tile(stand, (task.command_history, 1))
+        physics = self._engine.initial
+        memory = decision.start(task, robot, jnp.asarray(self.scene.stance.imu, jnp.float32))
         info = {
             "scenario": self._scenario(rng),
-            "heights": stand,
-            "commanded": commanded,
-            "imu": jnp.tile(still, (task.history, 1)),
-            "tilt": jnp.float32(0.0),
+            "memory": memory,
             "decision": jnp.int32(0),
+            "decisions_left": jnp.int32(task.episode_length),
             "truncation": jnp.float32(0.0),
         }
         if self._randomised:
             uniform = jax.random.uniform(key_conditions, (DRAWS,))
             info |= {
-                "conditions": draw_conditions(self.config.random, self.config.robot, uniform),
+                "conditions": draw_conditions(self.config.randomization, robot, uniform),
                 "noise_key": key_noise,
             }
-        metrics = {
-            name: jnp.float32(0.0)
-            for name in ("tilt_deg", "fall", "reward_level", "reward_toward", "reward_fail")
-        }
-        obs = observation(self.config, self.scene, state.qpos, commanded, info["imu"])
+        obs = decision.observation(task, robot, memory, physics.qpos[self.scene.leg_qpos])
         zero = jnp.float32(0.0)
-        return State(state, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
+        metrics = dict.fromkeys(
+            ("tilt_deg", "fall", "diverged", *(f"reward_{name}" for name in REWARDS)), zero
+        )
+        return State(physics, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
+
+    def reset_staggered(self, rng: jax.Array) -> State:
+        """`reset`, but with a random part of the episode's time limit already used.
+
+        For the first episodes of a batch, which would otherwise all time out together.
+        """
+        key_reset, key_left = jax.random.split(rng)
+        state = self.reset(key_reset)
+        left = jax.random.randint(key_left, (), 1, self.config.task.episode_length + 1)
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            info=state.info | {"decisions_left": left}
+        )
 
     def step(self, state: State, action: jax.Array) -> State:
         """Takes one decision.
@@ -119,54 +126,44 @@ class BalanceEnv(Env):
         Returns:
           The state `ctrl_dt` later.
         """
-        config, task = self.config, self.config.task
+        task, robot = self.config.task, self.scene.robot
         info: dict[str, Any] = state.info
-        fields: dict[str, jax.Array] = {}
         change = jnp.asarray(self._table)[action]
-        last = info["commanded"][-1]
-        heights = wanted = apply_action(task, config.robot, last, change)
+        late, fields = None, {}
         if self._randomised:
             late = info["conditions"].latency > 0
-            heights = jnp.where(late, last, wanted)
             fields = model_fields(self.scene, info["conditions"])
-        decision = info["decision"]
-        ctrl = decision_ctrl(
-            config, self.scene, info["scenario"], decision, info["heights"], heights
+        memory, targets = decision.controls(
+            task, robot, info["memory"], change, late, info["scenario"], info["decision"]
         )
-        moved, motion = self._advance(state.pipeline_state, ctrl, fields)  # pyright: ignore
-
-        fell = failed(task, motion.tilt).any()
-        truncated = ~fell & (decision + 1 >= task.episode_length)
-        # A diverged world has fallen; what is not a number must not reach the learner.
-        moved, motion = jax.tree.map(jnp.nan_to_num, (moved, motion))
-        after = motion.tilt.mean() if task.reward_tilt == "mean" else motion.tilt[-1]
-        terms = reward_terms(task, info["tilt"], after, fell.astype(after.dtype))
+        before: Any = state.pipeline_state
+        moved, motion = self._engine.advance(before, self.scene.ctrl(targets), fields)
         samples = motion.imu
         if self._randomised:
             key, key_noise = jax.random.split(info["noise_key"])
             noise = jax.random.normal(key_noise, samples.shape)
             samples = samples + info["conditions"].imu_noise * noise
             info = info | {"noise_key": key}
-        imu = extend_history(info["imu"], samples)
-        commanded = extend_history(info["commanded"], wanted[None])
+        angles = moved.qpos[self.scene.leg_qpos]
+        memory, outcome = decision.outcome(task, robot, memory, samples, motion.tilt, angles)
+        truncated = ~outcome.fell & (info["decisions_left"] <= 1)
         metrics = {
-            "tilt_deg": motion.tilt.mean(),
-            "fall": fell.astype(jnp.float32),
-            **{f"reward_{name}": term for name, term in terms.items()},
+            "tilt_deg": outcome.tilt.mean(),
+            "fall": outcome.fell.astype(jnp.float32),
+            "diverged": outcome.diverged.astype(jnp.float32),
+            **{f"reward_{name}": term for name, term in outcome.rewards.items()},
         }
         info = info | {
-            "heights": heights,
-            "commanded": commanded,
-            "imu": imu,
-            "tilt": after,
-            "decision": decision + 1,
+            "memory": memory,
+            "decision": info["decision"] + 1,
+            "decisions_left": info["decisions_left"] - 1,
             "truncation": truncated.astype(jnp.float32),
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=moved,
-            obs=observation(config, self.scene, moved.qpos, commanded, imu),
-            reward=sum(terms.values()),
-            done=(fell | truncated).astype(jnp.float32),
+            obs=outcome.obs,
+            reward=sum(outcome.rewards.values()),
+            done=(outcome.fell | truncated).astype(jnp.float32),
             metrics=state.metrics | metrics,
             info=info,
         )
@@ -178,11 +175,8 @@ class BalanceEnv(Env):
         """
         task = self.config.task
         count = tilt.num_targets(task, task.episode_length * task.ctrl_dt)
-        key_disc, key_square, key_which, key_phase, key_size = jax.random.split(key, 5)
-        share = jax.random.uniform(key_size, (2,))
-        random = self.config.random
-        limit = _between(task.max_incline, random.incline_max, share[0])
-        rate = _between(task.board_rate, random.rate_max, share[1])
+        key_disc, key_square, key_which, key_phase = jax.random.split(key, 4)
+        limit = jnp.float32(task.max_incline)
         disc = tilt.disc_targets(limit, *jax.random.uniform(key_disc, (2, count)))
         square = limit * jax.random.uniform(key_square, (count, 2), minval=-1.0)
         in_square = jax.random.bernoulli(key_which, task.square_share, (count, 1))
@@ -190,9 +184,4 @@ class BalanceEnv(Env):
         # The board starts level, so the first target is one it has already reached.
         targets = targets.at[0].set(0.0)
         phase = jax.random.uniform(key_phase) * task.target_period
-        return tilt.Scenario(targets, phase, rate)
-
-
-def _between(least: float, most: float | None, share: jax.Array) -> jax.Array:
-    """A share of the way from `least` to `most`; `least` if there is no `most`."""
-    return jnp.float32(least) + (0.0 if most is None else most - least) * share
+        return tilt.Scenario(targets, phase, jnp.float32(task.board_rate))

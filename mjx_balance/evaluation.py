@@ -6,28 +6,23 @@ simulation warning or a state that is not finite counts as a fall.
 """
 
 import dataclasses
-import os
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
-from mujoco.batch import Batch
 
-from mjx_balance.config import Config, RandomConfig, greatest_incline
-from mjx_balance.plant import View, decision_ctrl, observation, standing_heights
+from mjx_balance.config import Config, RandomizationConfig, greatest_incline
+from mjx_balance.controllers import Controller, View
+from mjx_balance.engines.mujoco import Motion, MujocoEngine
 from mjx_balance.policy import Policy, PolicyError
-from mjx_balance.scene import Scene, load_scene, model_fields
+from mjx_balance.scene import Scene, load_scene
 from mjx_balance.suites import authority, find_suite, make_scenarios
-from mjx_balance.task import tilt
-from mjx_balance.task.actions import action_table, apply_action
-from mjx_balance.task.conditions import Conditions
-from mjx_balance.task.observation import extend_history
-from mjx_balance.task.reward import body_tilt, failed
-
-Controller = Callable[[View], np.ndarray]
-"""Maps what there is to see of n worlds to action indices (n,)."""
+from mjx_balance.task import decision, tilt
+from mjx_balance.task.actions import action_table
+from mjx_balance.task.randomization import Conditions
+from mjx_balance.task.reward import failed
 
 SETTLED_SECONDS = 3.0
 """End of every target's period in which the board has long been at rest, s."""
@@ -68,6 +63,101 @@ class Rollout:
         return self.fell_at < self.tilt.shape[1]
 
 
+class _Trials:
+    """Scenarios under way; owns the physics and the memories of those that still stand."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: Config,
+        scenarios: tilt.Scenario,
+        conditions: Conditions | None,
+        noise_seed: int,
+        threads: int | None,
+    ):
+        count = len(scenarios.phase)
+        self.scene, self.config, self.scenarios = scene, config, scenarios
+        self.engine = MujocoEngine(scene, count, conditions, threads)
+        self.table = action_table(config.task)
+        # One generator per scenario: its noise is the same whoever runs or falls beside it. The
+        # last number tells it from the generator that drew the scenario (suites.py).
+        self.rngs = [np.random.default_rng((noise_seed, k, 1)) for k in range(count)]
+        self.late = np.zeros(count, bool)
+        self.imu_noise = np.zeros((count, 6))
+        if conditions is not None:
+            self.late, self.imu_noise = conditions.latency.astype(bool), conditions.imu_noise
+        self.noisy = bool(self.imu_noise.any())
+        self.alive = np.arange(count)
+        still = np.tile(scene.stance.imu, (count, 1))
+        self.memory = decision.start(config.task, scene.robot, still)
+        self.samples = np.tile(scene.stance.imu, (count, config.task.sim_steps, 1))
+        angles = self.engine.state(self.alive)[0][:, scene.leg_qpos]
+        self.obs = decision.observation(config.task, scene.robot, self.memory, angles)
+
+    def decide(self, controller: Controller, number: int) -> "_Decision":
+        """Lets the controller take decision `number` wherever the robot stands."""
+        task, robot, alive = self.config.task, self.scene.robot, self.alive
+        some = tilt.Scenario(*(x[alive] for x in self.scenarios))
+        late = self.late[alive]
+        qpos, qvel = self.engine.state(alive)
+        chosen = controller(View(alive, number, self.obs, self.samples, qpos, qvel, some, late))
+        change = self.table[chosen]
+        now = np.full(len(alive), float(number))
+        memory, targets = decision.controls(task, robot, self.memory, change, late, some, now)
+        motion = self.engine.advance(alive, self.scene.ctrl(targets))
+        samples = motion.imu
+        if self.noisy:
+            noise = np.stack([self.rngs[k].normal(size=samples.shape[1:]) for k in alive])
+            samples = samples + self.imu_noise[alive, None] * noise
+        angles = motion.qpos[:, -1][:, self.scene.leg_qpos]
+        memory, outcome = decision.outcome(task, robot, memory, samples, motion.tilt, angles)
+        down = outcome.fell | motion.warned
+        self.memory = decision.Memory(*(x[~down] for x in memory))
+        self.samples, self.obs, self.alive = samples[~down], outcome.obs[~down], alive[~down]
+        return _Decision(alive, 1000 * np.abs(change).mean(axis=-1), motion, down)
+
+
+class _Decision(NamedTuple):
+    """One decision of n scenarios."""
+
+    ids: np.ndarray
+    action_mm: np.ndarray
+    motion: Motion
+    down: np.ndarray
+
+
+class _Record:
+    """What is kept of a rollout; from a fall on, the tilt counts as `fail_tilt`."""
+
+    def __init__(self, scene: Scene, config: Config, count: int, decisions: int, keep_qpos: bool):
+        self.config, self.task = config, config.task
+        steps = decisions * self.task.sim_steps
+        self.tilt = np.full((count, steps), self.task.fail_tilt)
+        self.action_mm = np.full((count, decisions), np.nan)
+        self.fell_at = np.full(count, steps)
+        self.qpos = np.tile(scene.stance.qpos, (count, steps, 1)) if keep_qpos else None
+
+    def add(self, number: int, made: _Decision) -> None:
+        """Writes decision `number` down."""
+        sim_steps = self.task.sim_steps
+        ids, motion, down = made.ids, made.motion, made.down
+        span = slice(number * sim_steps, (number + 1) * sim_steps)
+        bad = failed(self.task, motion.tilt)
+        # Where only the engine has warned, all of the decision counts as fallen.
+        first = np.where(bad.any(axis=-1), bad.argmax(axis=-1), 0)
+        after_fall = down[:, None] & (np.arange(sim_steps) >= first[:, None])
+        self.tilt[ids, span] = np.where(after_fall, self.task.fail_tilt, motion.tilt)
+        self.fell_at[ids[down]] = number * sim_steps + first[down]
+        self.action_mm[ids, number] = made.action_mm
+        if self.qpos is not None:
+            self.qpos[ids, number * sim_steps :] = motion.qpos[:, -1:]
+            self.qpos[ids, span] = motion.qpos
+
+    def rollout(self, seconds: float) -> Rollout:
+        """The finished rollout."""
+        return Rollout(self.config, self.tilt, self.fell_at, self.action_mm, self.qpos, seconds)
+
+
 def roll_out(
     scene: Scene,
     config: Config,
@@ -91,77 +181,22 @@ def roll_out(
       threads: worker threads; all cores if none.
       record: whether to keep every qpos.
       progress: called with the share done.
-      conditions: of every world (n,); nominal if none.
+      conditions: of every scenario (n,); nominal if none.
       noise_seed: seed of the sensor noise.
 
     Returns:
       The rollout of n scenarios.
     """
-    task, robot = config.task, config.robot
-    count = len(scenarios.phase)
-    decisions = int(np.ceil(duration / task.ctrl_dt - 1e-9))
-    steps = decisions * task.sim_steps
-    table = action_table(task)
-    batch = Batch(scene.model, count, threads or os.cpu_count() or 1)
-    rng = np.random.default_rng(noise_seed)
-    sigma = None
-    latency = np.zeros(count, bool)
-    if conditions is not None:
-        for name, values in model_fields(scene, conditions).items():
-            batch.expand(name)[...] = values
-        batch.set_const()
-        latency = conditions.latency.astype(bool)
-        sigma = conditions.imu_noise if conditions.imu_noise.any() else None
-    batch.qpos = scene.stance.qpos
-    batch.qvel = scene.stance.qvel
-    batch.qacc_warmstart = scene.stance.qacc_warmstart
-    heights = np.tile(standing_heights(config), (count, 1))
-    commanded = np.tile(heights[:, None], (1, task.command_history, 1))
-    imu = np.tile(scene.stance.imu, (count, max(task.history, task.sim_steps), 1))
-    tilts = np.full((count, steps), task.fail_tilt)
-    actions = np.full((count, decisions), np.nan)
-    fell_at = np.full(count, steps)
-    trace = np.tile(scene.stance.qpos, (count, steps, 1)) if record else None
-    alive = np.arange(count)
+    decisions = int(np.ceil(duration / config.task.ctrl_dt - 1e-9))
+    trials = _Trials(scene, config, scenarios, conditions, noise_seed, threads)
+    kept = _Record(scene, config, len(scenarios.phase), decisions, record)
     began = time.perf_counter()
-    for k in range(decisions):
-        some = tilt.Scenario(*(x[alive] for x in scenarios))
-        qpos = batch.qpos[alive]
-        obs = observation(config, scene, qpos, commanded[alive], imu[alive, -task.history :])
-        recent = imu[alive, -task.sim_steps :]
-        chosen = controller(
-            View(alive, k, obs, recent, qpos, batch.qvel[alive], some, latency[alive])
-        )
-        before, last = heights[alive], commanded[alive, -1]
-        wanted = apply_action(task, robot, last, table[chosen])
-        commanded[alive] = extend_history(commanded[alive], wanted[:, None])
-        heights[alive] = np.where(latency[alive, None], last, wanted)
-        now = np.full(len(alive), float(k))
-        ctrl = decision_ctrl(config, scene, some, now, before, heights[alive])
-        out = batch.rollout(task.sim_steps, ctrl, record=("qpos", "sensordata"), ids=alive)
-        samples = out["sensordata"][..., scene.imu]
-        if sigma is not None:
-            samples = samples + sigma[alive, None] * rng.normal(size=samples.shape)
-        imu[alive] = extend_history(imu[alive], samples)
-        tilted = body_tilt(out["qpos"][..., scene.trunk_quat])
-        actions[alive, k] = 1000 * np.abs(table[chosen]).mean(axis=-1)
-
-        span = slice(k * task.sim_steps, (k + 1) * task.sim_steps)
-        bad = failed(task, tilted)
-        warned = np.asarray(batch.warning[alive]).reshape(len(alive), -1).any(axis=-1)
-        down = bad.any(axis=-1) | warned
-        first = np.where(bad.any(axis=-1), bad.argmax(axis=-1), 0)
-        after_fall = down[:, None] & (np.arange(task.sim_steps) >= first[:, None])
-        tilts[alive, span] = np.where(after_fall, task.fail_tilt, tilted)
-        fell_at[alive[down]] = k * task.sim_steps + first[down]
-        if trace is not None:
-            trace[alive, k * task.sim_steps :] = out["qpos"][:, -1:]
-            trace[alive, span] = out["qpos"]
-        alive = alive[~down]
-        progress((k + 1) / decisions)
-        if not len(alive):
+    for number in range(decisions):
+        kept.add(number, trials.decide(controller, number))
+        progress((number + 1) / decisions)
+        if not len(trials.alive):
             break
-    return Rollout(config, tilts, fell_at, actions, trace, time.perf_counter() - began)
+    return kept.rollout(time.perf_counter() - began)
 
 
 def summarize(rollout: Rollout, suite: str, duration: float, seed: int) -> dict[str, Any]:
@@ -293,7 +328,7 @@ def run_suite(
         duration,
         record=record,
         progress=progress,
-        conditions=conditions if find_suite(suite).random != RandomConfig() else None,
+        conditions=conditions if find_suite(suite).randomization != RandomizationConfig() else None,
         noise_seed=seed,
     )
 
@@ -366,7 +401,7 @@ def envelope(
         fall_rate=rollout.fell.reshape(shape).mean(axis=-1).tolist(),
         mean_tilt=rollout.tilt.mean(axis=-1).reshape(shape).mean(axis=-1).tolist(),
         authority=authority(config),
-        reach=greatest_incline(config.task, config.robot),
+        reach=greatest_incline(config.task, scene.robot),
         scenarios=scenarios,
         duration_s=duration,
         seed=seed,

@@ -9,7 +9,6 @@ and where the training came from.
 import hashlib
 import importlib.metadata
 import json
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,12 +18,25 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from mjx_balance.config import Config, check, from_dict, to_dict
+from mjx_balance.config import (
+    ACTION_AXES,
+    Config,
+    ConfigError,
+    check,
+    from_dict,
+    shown,
+    to_dict,
+)
+from mjx_balance.dqn import heads
+from mjx_balance.robots import find_robot
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
 
 FORMAT = "mjx_balance.policy"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+MOST_BYTES = 64 * 2**20
+MOST_MANIFEST = 4 * 2**20
+"""Larger files and manifests are no policies, whatever they say."""
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 
 
@@ -46,67 +58,36 @@ class Policy:
         Raises:
           PolicyError: if manifest and weights do not fit together.
         """
-        if not isinstance(manifest, dict):
-            raise PolicyError("its manifest is not a JSON object")
-        if manifest.get("format") != FORMAT:
-            raise PolicyError(f"format is {manifest.get('format')!r}; it must be {FORMAT!r}")
-        if manifest.get("version") != FORMAT_VERSION:
-            raise PolicyError(
-                f"format version is {manifest.get('version')!r}; this release reads "
-                f"version {FORMAT_VERSION}"
-            )
-        try:
-            self.config = check(from_dict(Config, manifest["config"]))
-            network = manifest["network"]
-            self.factors = tuple(int(n) for n in network["factors"])
-            self.radial = bool(network["radial"])
-            hidden_sizes = tuple(int(n) for n in network["hidden_sizes"])
-            self.actions = np.asarray(manifest["actions"]["table_m"], np.float32)
-            obs_size = len(manifest["observation"]["names"])
-            self.scene_hash = str(manifest["scene_hash"])
-            scale = np.asarray(manifest["observation"]["scale"], np.float32)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise PolicyError(f"its manifest cannot be used: {error}") from error
-        task, robot = self.config.task, self.config.robot
-        if self.actions.shape != (math.prod(self.factors), 2):
-            raise PolicyError(
-                f"its action table has shape {self.actions.shape}; its network chooses among "
-                f"{math.prod(self.factors)} actions"
-            )
-        agrees = {
-            "action table": np.array_equal(self.actions, action_table(task)),
-            "observation names": tuple(manifest["observation"]["names"])
-            == observation_names(task, robot),
-            "observation scale": np.array_equal(scale, observation_scale(task, robot)),
-        }
-        for name, same in agrees.items():
-            if not same:
-                raise PolicyError(f"its {name} is not the one that its own config gives")
+        self.config = _read_config(manifest)
         self.manifest = manifest
-        self.observation_size = obs_size
-        names = [f"hidden_{i}" for i in range(len(hidden_sizes))] + ["head"]
-        rows = [obs_size, *hidden_sizes]
-        columns = [*hidden_sizes, sum(self.factors)]
+        self.scene_hash: str = manifest["scene_hash"]
+        self.actions = action_table(self.config.task)
+        self.factors = action_factors(self.config)
+        self.radial = self.config.dqn.head == "radial"
+        self.observation_size = len(manifest["observation"]["names"])
+        hidden = self.config.dqn.hidden_sizes
+        names = [f"hidden_{i}" for i in range(len(hidden))] + ["head"]
+        rows = [self.observation_size, *hidden]
+        columns = [*hidden, sum(self.factors)]
+        shapes: dict[str, tuple[int, ...]] = {}
         if self.radial:
-            rows[-1] += obs_size
+            rows[-1] += self.observation_size
             columns[-1] = 1 + len(self.factors)
-            shape = _weight(weights, "profile", (4,))
-            self._profile = np.logaddexp(0, shape)
-            self._stretch = np.exp(_weight(weights, "stretch", (len(self.factors),)))
-            axes = [np.linspace(-1, 1, levels) for levels in self.factors]
-            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-            self._points = points.reshape(-1, len(self.factors)).astype(np.float32)
-        self._layers = []
+            shapes |= {"profile": (4,), "stretch": (len(self.factors),)}
         for name, n, m in zip(names, rows, columns, strict=True):
-            kernel = _weight(weights, f"{name}/kernel", (n, m))
-            self._layers.append((kernel, _weight(weights, f"{name}/bias", (m,))))
+            shapes |= {f"{name}/kernel": (n, m), f"{name}/bias": (m,)}
+        _check_weights(weights, shapes)
+        self._layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
+        if self.radial:
+            self._profile, self._stretch = weights["profile"], weights["stretch"]
+            self._points = heads.points(self.factors)
 
     @property
     def fingerprint(self) -> str:
         """Short digest of the weights."""
         arrays = [array for layer in self._layers for array in layer]
-        if self.radial:
-            arrays += [self._profile, self._stretch]
+        if self.radial:  # as they enter the head
+            arrays += [np.logaddexp(0, self._profile), np.exp(self._stretch)]
         return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
     def q_values(self, obs: np.ndarray) -> np.ndarray:
@@ -130,47 +111,81 @@ class Policy:
         for kernel, bias in self._layers[:-1]:
             x = np.maximum(x @ kernel + bias, 0.0)
         kernel, bias = self._layers[-1]
-        if self.radial:
-            out = np.concatenate((x, obs), axis=-1) @ kernel + bias
-            alpha, beta, kappa, delta = self._profile
-            away = (self._points - out[..., None, 1:]) * self._stretch
-            z = np.sqrt(delta**2 + np.sum(away**2, axis=-1))
-            return out[..., :1] + alpha * np.exp(-beta * z) - kappa * z
-        branches = np.split(x @ kernel + bias, np.cumsum(self.factors)[:-1], axis=-1)
-        values = branches[0]
-        for branch in branches[1:]:
-            values = values[..., :, None] + branch[..., None, :]
-            values = values.reshape(*values.shape[:-2], -1)
-        return values
+        if not self.radial:
+            return heads.added_up(x @ kernel + bias, self.factors)
+        out = np.concatenate((x, obs), axis=-1) @ kernel + bias
+        return heads.radial(out, self._profile, self._stretch, self._points)
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """Index of the best action: () for (obs_size,), (batch,) for (batch, obs_size)."""
         return np.argmax(self.q_values(obs), axis=-1)
 
 
-def _weight(weights: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    if name not in weights:
-        raise PolicyError(f"weight {name} is missing")
-    value = weights[name]
-    if value.shape != shape:
-        raise PolicyError(f"weight {name} has shape {value.shape}; it must be {shape}")
-    if not np.isfinite(value).all():
-        raise PolicyError(f"weight {name} holds values that are not finite numbers")
-    return value.astype(np.float32)
+def _read_config(manifest: Any) -> Config:
+    """The config of a manifest, all of whose other parts follow from it.
+
+    Raises:
+      PolicyError: for another format, a config that cannot be run, or a part that differs.
+    """
+    if not isinstance(manifest, dict):
+        raise PolicyError("its manifest is not a JSON object")
+    for name, wanted in (("format", FORMAT), ("version", FORMAT_VERSION)):
+        if manifest.get(name) != wanted:
+            raise PolicyError(
+                f"{name} is {shown(manifest.get(name))}; this release reads {wanted!r}"
+            )
+    for name, kind in (
+        ("config", dict),
+        ("scene_hash", str),
+        ("versions", dict),
+        ("training", dict),
+    ):
+        if not isinstance(manifest.get(name), kind):
+            what = {dict: "a JSON object", str: "a string"}[kind]
+            raise PolicyError(f"its {name} is {shown(manifest.get(name))}; it must be {what}")
+    try:
+        config = check(from_dict(Config, manifest["config"]))
+    except ConfigError as error:
+        raise PolicyError(f"its config cannot be used: {error}") from error
+    for part, wanted in _described(config).items():
+        if manifest.get(part) != wanted:
+            raise PolicyError(f"its {part} is not what its own config gives")
+    return config
 
 
-def make_manifest(
-    config: Config, scene_hash: str, factors: tuple[int, ...], training: Mapping[str, Any]
-) -> dict[str, Any]:
+def _check_weights(
+    weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]
+) -> None:
+    extra = sorted(set(weights) - set(shapes))
+    if extra:
+        raise PolicyError(f"weight {shown(extra[0])} is none of this network's")
+    for name, shape in shapes.items():
+        if name not in weights:
+            raise PolicyError(f"weight {name} is missing")
+        value = weights[name]
+        if value.shape != shape or value.dtype != np.float32:
+            raise PolicyError(
+                f"weight {name} is {value.dtype} of shape {value.shape}; it must be float32 of "
+                f"shape {shape}"
+            )
+        if not np.isfinite(value).all():
+            raise PolicyError(f"weight {name} holds values that are not finite numbers")
+
+
+def action_factors(config: Config) -> tuple[int, ...]:
+    """Output branches of the network: all actions at once, or roll and pitch apart."""
+    levels = config.task.action_levels
+    return (levels**ACTION_AXES,) if config.dqn.head == "joint" else (levels,) * ACTION_AXES
+
+
+def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) -> dict[str, Any]:
     """Describes a policy.
 
     Args:
       config: what it was trained with.
       scene_hash: fingerprint of the scene it was trained in.
-      factors: sizes of the network's action branches.
       training: provenance, e.g. decisions and seconds.
     """
-    task = config.task
     versions = {}
     for package in VERSIONED:
         try:
@@ -181,25 +196,35 @@ def make_manifest(
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "config": to_dict(config),
+        **_described(config),
+        "scene_hash": scene_hash,
+        "versions": versions,
+        "training": dict(training),
+    }
+
+
+def _described(config: Config) -> dict[str, Any]:
+    """What follows from a config, written out for whoever runs the policy elsewhere."""
+    task, robot = config.task, find_robot(config.robot)
+    return {
+        "robot": to_dict(robot),
         "network": {
             "hidden_sizes": list(config.dqn.hidden_sizes),
-            "factors": list(factors),
+            "factors": list(action_factors(config)),
             "radial": config.dqn.head == "radial",
         },
         "observation": {
-            "names": list(observation_names(task, config.robot)),
-            "scale": observation_scale(task, config.robot).tolist(),
+            "names": list(observation_names(task, robot)),
+            "scale": observation_scale(task, robot).tolist(),
             "height_offset_m": task.body_height,
             "imu_lag_s": task.sim_dt,
+            "imu_mean_samples": task.imu_mean,
         },
         "actions": {
             "table_m": action_table(task).tolist(),
             "ramp_s": task.ramp_steps * task.sim_dt,
         },
         "rates_hz": {"decision": 1 / task.ctrl_dt, "imu": 1 / task.sim_dt},
-        "scene_hash": scene_hash,
-        "versions": versions,
-        "training": dict(training),
     }
 
 
@@ -241,16 +266,36 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     Raises:
       PolicyError: if it is missing, truncated, or not a policy this release can run.
     """
-    if not Path(path).is_file():
+    path = Path(path)
+    if not path.is_file():
         raise PolicyError(f"no policy file at {path}; `mjx-balance train` writes one")
+    if path.stat().st_size > MOST_BYTES:
+        raise PolicyError(
+            f"{path} has {path.stat().st_size} bytes; no policy has more than {MOST_BYTES}"
+        )
     try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        if "manifest" not in metadata:
-            raise PolicyError("it carries no manifest, so it is no policy of mjx_balance")
-        return Policy(json.loads(metadata["manifest"]), weights)
-    except (safetensors.SafetensorError, json.JSONDecodeError) as error:
+        return Policy(*_read(path))
+    except (safetensors.SafetensorError, OSError, UnicodeDecodeError) as error:
         raise PolicyError(f"{path} is damaged or no safetensors file: {error}") from error
     except PolicyError as error:
         raise PolicyError(f"{path} cannot be used: {error}") from error
+
+
+def _read(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    """Manifest and weights of a safetensors file."""
+    with safetensors.safe_open(path, framework="numpy") as file:
+        text = (file.metadata() or {}).get("manifest")
+        if text is None:
+            raise PolicyError("it carries no manifest, so it is no policy of mjx_balance")
+        if len(text) > MOST_MANIFEST:
+            raise PolicyError(f"its manifest has {len(text)} characters, more than {MOST_MANIFEST}")
+        for name in file.keys():  # noqa: SIM118
+            # NumPy has no name for some of the types that safetensors knows.
+            if file.get_slice(name).get_dtype() != "F32":
+                kind = file.get_slice(name).get_dtype()
+                raise PolicyError(f"weight {shown(name)} is {kind}; it must be F32 (float32)")
+        weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    try:
+        return json.loads(text), weights
+    except (ValueError, RecursionError) as error:
+        raise PolicyError(f"its manifest is no JSON: {error}") from error

@@ -4,19 +4,18 @@ import dataclasses
 import hashlib
 import math
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjx_balance.config import Config, ConfigError, RobotConfig
+from mjx_balance.config import Config, ConfigError
+from mjx_balance.robots import Robot, find_robot
 from mjx_balance.task import Array
-from mjx_balance.task.conditions import Conditions
-from mjx_balance.task.legs import joint_angles
+from mjx_balance.task.decision import Targets
+from mjx_balance.task.kinematics import joint_angles
 
 VISUAL_GROUP = 2
 ROBOT, BOARD = "robot/", "board/"
-LEG_JOINTS = ("abduction", "hip", "knee")
 CONTACT_TIME = 0.01
 """Time constant of the foot contacts, s: near the shortest that 4 ms steps carry."""
 SETTLE_STEPS = 750
@@ -51,6 +50,7 @@ class Stance:
 class Scene:
     """A compiled model and the addresses everything else needs, looked up once by name."""
 
+    robot: Robot
     model: mujoco.MjModel
     leg_qpos: np.ndarray
     """(legs, 3) addresses of the leg joints in qpos."""
@@ -65,6 +65,14 @@ class Scene:
     imu: np.ndarray
     """(6,) addresses of gyro and accelerometer in sensordata."""
     stance: Stance
+
+    def ctrl(self, targets: Targets) -> Array:
+        """Servo targets (..., sim_steps, nu) in the model's order, rad."""
+        joints = targets.joints + self.stance.leg_trim.astype(targets.joints.dtype)
+        xp = joints.__array_namespace__()
+        flat = (targets.board, joints.reshape(*joints.shape[:-2], -1))
+        order = np.argsort(np.concatenate((self.board_ctrl, self.leg_ctrl.ravel())))
+        return xp.concatenate(flat, axis=-1)[..., order]
 
     @property
     def hash(self) -> str:
@@ -82,15 +90,16 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
     """
     stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
     board = mujoco.MjSpec.from_file(str(scene_dir() / "board.xml"))
-    robot = mujoco.MjSpec.from_file(str(scene_dir() / "quadruped.xml"))
+    robot = find_robot(config.robot)
+    body = mujoco.MjSpec.from_file(str(scene_dir() / robot.model))
     height = config.task.body_height
     stage.attach(board, prefix=BOARD, frame=stage.worldbody.add_frame())
-    stage.attach(robot, prefix=ROBOT, frame=stage.worldbody.add_frame(pos=[0, 0, height]))
-    friction = config.robot.foot_friction
-    for leg in config.robot.legs:
+    stage.attach(body, prefix=ROBOT, frame=stage.worldbody.add_frame(pos=[0, 0, height]))
+    friction = robot.foot_friction
+    for leg, foot in zip(robot.legs, robot.feet, strict=True):
         stage.add_pair(
             name=f"{leg}_contact",
-            geomname1=f"{ROBOT}{leg}_foot",
+            geomname1=f"{ROBOT}{foot}",
             geomname2=f"{BOARD}board",
             condim=3,
             friction=[friction, friction, 0.005, 0.0001, 0.0001],
@@ -101,24 +110,26 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
         for geom in [g for g in stage.geoms if g.group == VISUAL_GROUP]:
             stage.delete(geom)
     model = stage.compile()
-    for name, modelled in robot_numbers(config.robot, model).items():
-        value = getattr(config.robot, name)
+    for name, modelled in robot_numbers(robot, model).items():
+        value = getattr(robot, name)
         if not math.isclose(modelled, value, rel_tol=1e-3):
             raise ConfigError(
-                f"{name} is {value}, but the robot in quadruped.xml has {modelled:g}; "
+                f"{name} is {value}, but the robot in {robot.model} has {modelled:g}; "
                 "change both or neither"
             )
     return model
 
 
-def robot_numbers(robot: RobotConfig, model: mujoco.MjModel) -> dict[str, float]:
-    """Reads the fields of `RobotConfig` back from the compiled model, in their units."""
-    leg = robot.legs[0]
-    hip, thigh, calf = (model.body(f"{ROBOT}{leg}_{part}") for part in ("hip", "thigh", "calf"))
-    foot = model.geom(f"{ROBOT}{leg}_foot")
-    trunk = model.body(f"{ROBOT}trunk")
-    knee_joint, knee_servo = model.joint(f"{ROBOT}{leg}_knee"), model.actuator(f"{ROBOT}{leg}_knee")
-    hip_servo = model.actuator(f"{ROBOT}{leg}_hip")
+def robot_numbers(robot: Robot, model: mujoco.MjModel) -> dict[str, float]:
+    """Reads the numbers of a robot's record back from the compiled model, in their units."""
+    abduction, hip_joint, knee = (f"{ROBOT}{name}" for name in robot.joints[0])
+    hip, thigh, calf = (
+        model.body(model.jnt_bodyid[model.joint(name).id]) for name in (abduction, hip_joint, knee)
+    )
+    foot = model.geom(f"{ROBOT}{robot.feet[0]}")
+    trunk = model.body(f"{ROBOT}{robot.trunk}")
+    knee_joint, knee_servo = model.joint(knee), model.actuator(knee)
+    hip_servo = model.actuator(hip_joint)
     return {
         "hip_x": hip.pos[0],
         "hip_y": hip.pos[1],
@@ -143,15 +154,17 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     Raises:
       ConfigError: if the robot does not come to rest upright.
     """
+    robot = find_robot(config.robot)
     model = build_model(config, visual)
-    names = [[f"{ROBOT}{leg}_{joint}" for joint in LEG_JOINTS] for leg in config.robot.legs]
+    names = [[f"{ROBOT}{joint}" for joint in leg] for leg in robot.joints]
     leg_qpos = np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names])
     leg_ctrl = np.asarray([[model.actuator(n).id for n in leg] for leg in names])
     board = [f"{BOARD}board_{axis}" for axis in "xy"]
-    root = model.joint(f"{ROBOT}root").qposadr[0]
-    sensors = [model.sensor(f"{ROBOT}{name}") for name in ("gyro", "accelerometer")]
+    root = model.joint(f"{ROBOT}{robot.root}").qposadr[0]
+    sensors = [model.sensor(f"{ROBOT}{name}") for name in (robot.gyro, robot.accelerometer)]
     imu = np.concatenate([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in sensors])
     return Scene(
+        robot=robot,
         model=model,
         leg_qpos=leg_qpos,
         leg_ctrl=leg_ctrl,
@@ -159,12 +172,13 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
         board_ctrl=np.asarray([model.actuator(n).id for n in board]),
         trunk_quat=np.arange(root + 3, root + 7),
         imu=imu,
-        stance=settle(config, model, leg_qpos, leg_ctrl, root, imu),
+        stance=settle(config, robot, model, leg_qpos, leg_ctrl, root, imu),
     )
 
 
 def settle(
     config: Config,
+    robot: Robot,
     model: mujoco.MjModel,
     leg_qpos: np.ndarray,
     leg_ctrl: np.ndarray,
@@ -177,7 +191,7 @@ def settle(
     to the trim, as the integral term of a servo would.
     """
     task = config.task
-    wanted = joint_angles(config.robot, np.full(len(config.robot.legs), task.body_height))
+    wanted = joint_angles(robot, np.full(len(robot.legs), task.body_height))
     trim = np.zeros_like(wanted)
     data = mujoco.MjData(model)
     data.qpos[root : root + 7] = (0, 0, task.body_height, 1, 0, 0, 0)
@@ -193,7 +207,7 @@ def settle(
     if not (upright and np.abs(data.qvel).max() < 0.01):
         raise ConfigError(
             f"the robot does not stand still at body_height {task.body_height} m with "
-            f"servo_stiffness {config.robot.servo_stiffness} N m/rad; try the defaults"
+            f"servo_stiffness {robot.servo_stiffness} N m/rad; try the defaults"
         )
     return Stance(
         qpos=data.qpos.copy(),
@@ -204,60 +218,26 @@ def settle(
     )
 
 
-def model_fields(scene: Scene, conditions: Conditions) -> dict[str, Array]:
-    """The model's fields in given circumstances, for `mjx.Model.replace` or `Batch.expand`.
-
-    The payload is a point mass; its products of inertia are left out.
-
-    Args:
-      scene: the nominal model.
-      conditions: of one world or a batch (...).
-
-    Returns:
-      Field name -> (..., *shape of the field).
-    """
-    model, xp = scene.model, conditions.payload.__array_namespace__()
-    trunk = model.body(f"{ROBOT}trunk").id
-    load, at = conditions.payload[..., None], conditions.payload_at
-    mass, centre = model.body_mass[trunk], model.body_ipos[trunk]
-    moved = (mass * centre + load * at) / (mass + load)
-    arm = at - centre
-    spread = xp.sum(arm**2, axis=-1, keepdims=True) - arm**2
-    inertia = model.body_inertia[trunk] + mass * load / (mass + load) * spread
-    gain = conditions.gain[..., None]
-    friction = conditions.friction[..., None, None] * np.ones((model.npair, 2))
-    stiffness = model.actuator_gainprm[scene.leg_ctrl.ravel(), 0] * gain
-
-    def put(field: np.ndarray, where: tuple[Any, ...], value: Array) -> Array:
-        base = xp.zeros((*value.shape[: conditions.payload.ndim], *field.shape)) + field
-        if hasattr(base, "at"):  # JAX arrays are immutable
-            return base.at[(..., *where)].set(value)
-        base[(..., *where)] = value
-        return base
-
-    legs = scene.leg_ctrl.ravel()
-    return {
-        "body_mass": put(model.body_mass, (trunk,), (mass + load)[..., 0]),
-        "body_ipos": put(model.body_ipos, (trunk, slice(None)), moved),
-        "body_inertia": put(model.body_inertia, (trunk, slice(None)), inertia),
-        "actuator_gainprm": put(model.actuator_gainprm, (legs, 0), stiffness),
-        "actuator_biasprm": put(model.actuator_biasprm, (legs, 1), -stiffness),
-        "pair_friction": put(model.pair_friction, (slice(None), slice(0, 2)), friction),
-    }
-
-
 _HASHED = (
-    "body_mass body_inertia body_ipos body_iquat body_pos body_quat jnt_type jnt_axis "
-    "jnt_pos jnt_range jnt_limited jnt_solref jnt_stiffness qpos0 dof_armature "
-    "dof_damping dof_frictionloss actuator_gainprm actuator_biasprm actuator_forcerange "
-    "actuator_ctrlrange actuator_gear site_pos site_quat pair_friction pair_solref "
-    "pair_solimp pair_margin pair_gap pair_dim pair_solreffriction sensor_type "
-    "sensor_objid"
+    "body_parentid body_mass body_inertia body_ipos body_iquat body_pos body_quat "
+    "body_gravcomp jnt_type jnt_axis jnt_pos jnt_range jnt_limited jnt_solref jnt_solimp "
+    "jnt_margin jnt_stiffness jnt_actfrclimited jnt_actfrcrange qpos0 qpos_spring "
+    "dof_parentid dof_armature dof_damping dof_frictionloss dof_solref dof_solimp "
+    "actuator_trntype actuator_trnid actuator_dyntype actuator_dynprm actuator_gaintype "
+    "actuator_gainprm actuator_biastype actuator_biasprm actuator_forcelimited "
+    "actuator_forcerange actuator_ctrllimited actuator_ctrlrange actuator_gear site_bodyid "
+    "site_pos site_quat pair_friction pair_solref pair_solimp pair_margin pair_gap pair_dim "
+    "pair_solreffriction sensor_type sensor_objid sensor_cutoff sensor_noise"
+).split()
+_HASHED_OPTIONS = (
+    "timestep gravity wind density viscosity integrator cone impratio jacobian solver iterations "
+    "tolerance ls_iterations ls_tolerance noslip_iterations noslip_tolerance o_margin o_solref "
+    "o_solimp o_friction disableflags enableflags disableactuator"
 ).split()
 
 
 def scene_hash(model: mujoco.MjModel) -> str:
-    """Hashes what the dynamics depend on, to six significant digits.
+    """Hashes what the dynamics depend on, the solver included, to six significant digits.
 
     Args:
       model: with or without its visual geoms; both give the same hash.
@@ -266,12 +246,11 @@ def scene_hash(model: mujoco.MjModel) -> str:
       16 hexadecimal digits.
     """
     digest = hashlib.sha256()
-    collides = np.isin(np.arange(model.ngeom), np.r_[model.pair_geom1, model.pair_geom2])
+    touching = np.r_[model.pair_geom1, model.pair_geom2]
     parts = [getattr(model, name) for name in _HASHED]
-    parts += [model.geom_size[collides], model.geom_pos[collides], model.geom_quat[collides]]
-    option = model.opt
-    parts += [option.timestep, option.gravity, option.integrator]
-    parts += [option.cone, option.impratio, option.disableflags]
+    geoms = (model.geom_type, model.geom_size, model.geom_pos, model.geom_quat, model.geom_bodyid)
+    parts += [field[touching] for field in geoms]
+    parts += [getattr(model.opt, name) for name in _HASHED_OPTIONS]
     for part in parts:
         digest.update(",".join(f"{x:.6g}" for x in np.ravel(part)).encode() + b";")
     return digest.hexdigest()[:16]

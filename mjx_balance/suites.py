@@ -6,9 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_balance.config import Config, RandomConfig, greatest_incline
+from mjx_balance.config import Config, RandomizationConfig, greatest_incline
+from mjx_balance.robots import find_robot
 from mjx_balance.task import tilt
-from mjx_balance.task.conditions import DRAWS, Conditions, draw_conditions
+from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
 
 
 class SuiteError(ValueError):
@@ -20,8 +21,9 @@ def authority(config: Config) -> float:
 
     `action_max` per decision over the longer of the two half-tracks, fore-aft.
     """
+    robot = find_robot(config.robot)
     speed = config.task.action_max / config.task.ctrl_dt
-    return math.degrees(speed / max(config.robot.hip_x, config.robot.half_track))
+    return math.degrees(speed / max(robot.hip_x, robot.half_track))
 
 
 def _disc(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
@@ -39,7 +41,7 @@ class Suite:
     """A kind of scenario."""
 
     summary: str
-    random: RandomConfig = dataclasses.field(default_factory=RandomConfig)
+    randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
     """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg."""
     fast: bool = False
@@ -53,18 +55,46 @@ SUITES: dict[str, Suite] = {
     "corner": Suite("both axes at max_incline at once", targets=_corner),
     "noise": Suite(
         "IMU noise of a data sheet on every sample",
-        RandomConfig(gyro_noise=0.002, accel_noise=0.023),
+        RandomizationConfig(gyro_noise=0.002, accel_noise=0.023),
     ),
-    "payload": Suite("0 to 5 kg on the trunk, off its centre", RandomConfig(payload=5.0)),
+    "payload": Suite("0 to 5 kg on the trunk, off its centre", RandomizationConfig(payload=5.0)),
     "friction": Suite(
-        "foot friction from 0.4 to 1.0", RandomConfig(friction_min=0.4, friction_max=1.0)
+        "foot friction from 0.4 to 1.0", RandomizationConfig(friction_min=0.4, friction_max=1.0)
     ),
-    "gains": Suite("servo gains off by up to 20%", RandomConfig(gain_spread=0.2)),
-    "latency": Suite("every action one decision late", RandomConfig(latency_share=1.0)),
+    "gains": Suite("servo gains off by up to 20%", RandomizationConfig(gain_spread=0.2)),
+    "latency": Suite("every action one decision late", RandomizationConfig(latency_share=1.0)),
     "fast": Suite("board speeds up to what the action set can follow", fast=True),
     "steep": Suite("inclines up to what the legs can reach", steep=True),
 }
 """By the names of `mjx-balance evaluate --suite`."""
+
+
+HEADLINE = ("paper", "corner")
+"""Suites of the figures that come first: after training, in reports and tables."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Seeds:
+    """Seeds of scenarios, one per purpose, so that none is used for two.
+
+    Training draws from other generators and sees none of them.
+    """
+
+    final: int = 1_000_000
+    """Evaluation after training."""
+    record: int = 2_000_000
+    """Rollouts drawn as figures."""
+    validation: int = 3_000_000
+    """Choice among several training seeds; never reported."""
+    report: int = 4_000_000
+    """Policy against baselines, in a report."""
+    tuning: int = 5_000_000
+    """Gains of the baselines."""
+    held_out: int = 7_000_000
+    """Published results."""
+
+
+SEEDS = Seeds()
 
 
 def find_suite(name: str) -> Suite:
@@ -85,7 +115,7 @@ def make_scenarios(
       SuiteError: for an unknown suite, a negative seed, or a board that does not arrive
         before its next target.
     """
-    chosen, task = find_suite(suite), config.task
+    chosen, task, robot = find_suite(suite), config.task, find_robot(config.robot)
     if seed < 0:
         raise SuiteError(f"seed is {seed}; it must not be negative")
     count = tilt.num_targets(task, duration)
@@ -96,7 +126,7 @@ def make_scenarios(
     if chosen.fast:
         rate += np.maximum(authority(config) - task.board_rate, 0) * others[:, DRAWS]
     if chosen.steep:
-        steepest = greatest_incline(task, config.robot)
+        steepest = greatest_incline(task, robot)
         incline += np.maximum(steepest - task.max_incline, 0) * others[:, DRAWS + 1]
     longest = float(np.max(2 * incline / rate))
     if longest > task.target_period:
@@ -105,4 +135,4 @@ def make_scenarios(
             f"{longest:.1f} s to its target; the period must not be shorter"
         )
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
-    return scenario, draw_conditions(chosen.random, config.robot, others[:, :DRAWS])
+    return scenario, draw_conditions(chosen.randomization, robot, others[:, :DRAWS])

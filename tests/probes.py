@@ -92,3 +92,69 @@ class PositiveState(NoisyState):
     def reset(self, rng: jax.Array) -> State:
         state = super().reset(rng)
         return state.replace(obs=jnp.abs(jnp.asarray(state.obs)))
+
+
+class Walk(Probe):
+    """Three steps of a walk that has a number: every observation says where it belongs.
+
+    Observes (walk, steps taken); `walk` is drawn by the reset. Action a earns
+    10 walk + steps + a / 2. The third step ends the walk, in a termination after action 1,
+    by time after action 0: the last observation, (walk, 3), is none of a reset.
+    """
+
+    @property
+    def observation_size(self) -> int:
+        return 2
+
+    def reset(self, rng: jax.Array) -> State:
+        state = super().reset(rng)
+        return state.replace(
+            obs=jnp.stack((jax.random.uniform(rng), 0.0)), metrics={"steps": jnp.float32(0.0)}
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        walk, steps = jnp.asarray(state.obs)
+        last = steps == 2
+        ends, late = last & (action == 1), last & (action == 0)
+        after = self._next(state, 0.0, 10 * walk + steps + action / 2, ends, late)
+        obs = jnp.stack((walk, steps + 1))
+        return after.replace(obs=obs, metrics={"steps": steps + 1})
+
+
+class Turn(Probe):
+    """Two numbers turn, every third state or so ends: for comparison with a second learner."""
+
+    @property
+    def observation_size(self) -> int:
+        return 2
+
+    def reset(self, rng: jax.Array) -> State:
+        state = super().reset(rng)
+        return state.replace(obs=jax.random.uniform(rng, (2,), minval=-1.0))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        x, y = jnp.asarray(state.obs)
+        after = self._next(state, 0.0, x * (2.0 * action - 1) + 0.3, terminated=y > 0.3)
+        return after.replace(obs=jnp.stack((0.8 * y + 0.4, 0.5 - x)))
+
+
+class Fork(TwoSteps):
+    """As TwoSteps, but the second step earns 1 by action 1 and loses 1 by action 0.
+
+    What the first step is worth depends on how the values of the second are bootstrapped:
+    while the target network is still the initial one, on that network alone.
+    """
+
+    def step(self, state: State, action: jax.Array) -> State:
+        second = jnp.asarray(state.obs)[0] - 1
+        return self._next(state, 2 - second, second * (2.0 * action - 1), terminated=second)
+
+
+class NoTimeLimit(NoisyState):
+    """An env of other people's: no truncation, nothing but what brax asks for."""
+
+    def reset(self, rng: jax.Array) -> State:
+        return super().reset(rng).replace(info={})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return super().step(state, action).replace(info={})

@@ -8,13 +8,9 @@ import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 from hypothesis import given, settings
 
-from mjx_balance.config import DQNConfig
-from mjx_balance.dqn.learner import Learner
-from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.training.checkpoints import CheckpointError, restore, save, saved_steps
 
 
@@ -136,22 +132,3 @@ def test_any_damage_is_found_out(
     else:
         file.unlink()
     assert restored(folder) == 5
-
-
-def test_a_restored_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    """With everything a run is made of, spread over two devices."""
-    config = DQNConfig(batch_size=32, replay_capacity=512, min_replay_size=16)
-    learner = Learner(probes.NoisyState(), QNetwork((16,), (2,)), config, 8, 800)
-    assert learner.num_devices == 2
-    program = learner.train_program(10)
-    state, _ = program(learner.init(0))
-    save(tmp_path, int(state.env_steps), state)
-    uninterrupted, _ = program(state)
-    saved = restore(tmp_path, learner.init(7), pytest.fail)
-    assert saved is not None
-    resumed, _ = program(saved)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_array_equal(jax.device_get(a), jax.device_get(b)),
-        resumed,
-        uninterrupted,
-    )

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from mjx_balance import training
 from mjx_balance.cli import main
 from mjx_balance.config import ConfigError, preset, to_dict
 from mjx_balance.env import BalanceEnv
 from mjx_balance.policy import PolicyError
 from mjx_balance.run_folder import RunFolderError, create_run_folder, locked
-from mjx_balance.training import CheckpointError, run
+from mjx_balance.training import run
+from mjx_balance.training.checkpoints import CheckpointError
 
 
 @pytest.fixture(autouse=True)
@@ -51,8 +51,7 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (("--seed", "4294967296"), "seed is 4294967296"),
         (("--reward-tilt", "sideways"), "--reward-tilt"),
         (("--payload", "-1"), "payload is -1.0"),
-        (("--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
-        (("--thigh", "0.25"), "thigh is 0.25"),
+        (("--num-envs", "64", "--num-devices", "8"), "num_devices is 8"),
         (("--eval-scenarios", "100000000"), "eval_scenarios is 100000000 and duration 60 s: that"),
         (("--learning-rate", "nan"), "learning_rate is nan"),
         (("--resume", "nowhere"), "nowhere is no run folder"),
@@ -95,7 +94,7 @@ def test_an_unwritable_run_folder_is_said(
             1,
             "mjx-balance: cannot write runs/a: No space left on device",
         ),
-        (training.Interrupted("go on with --resume x"), 130, "go on with --resume x"),
+        (run.Interrupted("go on with --resume x"), 130, "go on with --resume x"),
         (KeyboardInterrupt(), 130, ""),
     ],
     ids=lambda value: type(value).__name__,
@@ -110,7 +109,7 @@ def test_no_training_ends_in_a_traceback(
     def train(*given: object) -> None:
         raise error
 
-    monkeypatch.setattr(training, "train", train)
+    monkeypatch.setattr(run, "train", train)
     assert main(["train", "--preset", "smoke"]) == code
     shown = capsys.readouterr()
     assert " ".join((shown.out + shown.err).split()) == said
@@ -120,7 +119,7 @@ def test_flags_start_from_the_preset_or_from_the_resumed_run(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     given: list[Any] = []
-    monkeypatch.setattr(training, "train", lambda *arguments: given.append(arguments[:3]))
+    monkeypatch.setattr(run, "train", lambda *arguments: given.append(arguments[:3]))
     assert main(["train", "--preset", "smoke", "--gamma", "0.7", "--run-dir", "a"]) == 0
     config, run_dir, resume = given[0]
     assert (config.preset, config.num_envs, config.dqn.gamma) == ("smoke", 64, 0.7)

@@ -18,7 +18,8 @@ CONFIG = preset("default")
 
 
 def with_batch(size: int, **changes: Any):
-    dqn = dataclasses.replace(CONFIG.dqn, batch_size=size)
+    """One gradient step per decision of an env: a whole number, whatever their number."""
+    dqn = dataclasses.replace(CONFIG.dqn, batch_size=size, replay_ratio=float(size))
     return dataclasses.replace(CONFIG, dqn=dqn, **changes)
 
 
@@ -61,8 +62,8 @@ def test_what_cannot_be_shared_is_refused(config: Any, said: str) -> None:
 
 
 def test_sizes_that_are_given_stay() -> None:
-    sized = size_to_device(with_batch(512, num_envs=32, num_devices=1))
-    assert (sized.num_envs, sized.num_devices, sized.dqn) == (32, 1, CONFIG.dqn)
+    given = with_batch(512, num_envs=32, num_devices=1)
+    assert size_to_device(given) == given
 
 
 def test_a_replay_smaller_than_one_decision_of_all_envs_is_refused() -> None:

@@ -18,7 +18,9 @@ from mjx_balance.config import ConfigError, preset
 from mjx_balance.display import Display
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.policy import Policy, PolicyError
+from mjx_balance.robots import find_robot
 from mjx_balance.run_folder import RunFolder
+from mjx_balance.suites import SEEDS
 from mjx_balance.task.observation import observation_names
 from mjx_balance.training import finish
 
@@ -46,7 +48,7 @@ class Learner:
         return state.params
 
 
-OBS = len(observation_names(CONFIG.task, CONFIG.robot))
+OBS = len(observation_names(CONFIG.task, find_robot(CONFIG.robot)))
 PARAMS = Learner.network.init(jax.random.PRNGKey(0), jnp.zeros(OBS))
 
 
@@ -147,17 +149,17 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         asked.append((policy.config.seed, suite, scenarios, duration, seed))
         bar(1.0)
         falls, mean = VALIDATION[policy.config.seed]
-        if seed == finish.EVALUATION_SEED:  # the other way round: it must not decide
+        if seed == SEEDS.final:  # the other way round: it must not decide
             falls, mean = 7, 1 - mean
         return result(suite, falls, mean, seed)
 
-    def draw(path: Path, policy: Policy) -> None:
-        assert not RunFolder(path).evaluation.exists()
-        asked.append(("figures", policy.config.seed))
+    def draw(folder: RunFolder) -> None:
+        assert not folder.evaluation.exists()
+        asked.append(("figures", load_policy(folder.policy).config.seed))
 
     monkeypatch.setattr(finish.evaluation, "evaluate", evaluate)
-    monkeypatch.setattr(finish.figures, "draw_figures", draw)
-    monkeypatch.setattr(finish.report, "print_summary", lambda *given: asked.append("summary"))
+    monkeypatch.setattr(finish, "_draw", draw)
+    monkeypatch.setattr(finish.tables, "print_summary", lambda *given: asked.append("summary"))
     return asked
 
 
@@ -170,7 +172,7 @@ def finished(folder: RunFolder, *scales: float) -> dict[str, Any]:
 
 def test_one_seed_is_evaluated_on_both_suites(folder: RunFolder, calls: list[Any]) -> None:
     results = finished(folder, 1.0)
-    seed = finish.EVALUATION_SEED
+    seed = SEEDS.final
     assert calls == [
         (SEED, "paper", 4, 5.0, seed),
         (SEED, "corner", 4, 5.0, seed),
@@ -195,15 +197,15 @@ def test_the_best_seed_is_chosen_by_the_validation_alone(
     assert json.loads(folder.evaluation.read_text()) == results
     assert results["paper"]["tilt_deg"]["mean"] == pytest.approx(0.6)
     validated = seeds["seeds"][2]["validation"]["paper"]
-    assert (validated["falls"], validated["seed"]) == (1, finish.VALIDATION_SEED)
+    assert (validated["falls"], validated["seed"]) == (1, SEEDS.validation)
     assert seeds["statistics"]["corner"]["seeds"] == 4
     assert seeds["statistics"]["corner"]["falls"] == 28
     asked = {call[2:] for call in calls if len(call) == 5}
     assert asked == {
-        (4, 5.0, finish.EVALUATION_SEED),
-        (finish.VALIDATION_SCENARIOS, 5.0, finish.VALIDATION_SEED),
+        (4, 5.0, SEEDS.final),
+        (finish.VALIDATION_SCENARIOS, 5.0, SEEDS.validation),
     }
-    assert finish.EVALUATION_SEED != finish.VALIDATION_SEED
+    assert SEEDS.final != SEEDS.validation
 
 
 def test_a_diverged_seed_is_never_chosen(folder: RunFolder, calls: list[Any]) -> None:
@@ -229,7 +231,7 @@ def test_a_run_killed_while_it_finishes_finishes_again(
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(finish.figures, "draw_figures", die)
+        patch.setattr(finish, "_draw", die)
         with pytest.raises(Killed):
             finished(folder, 1.0)
     assert not folder.evaluation.exists()

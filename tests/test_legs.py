@@ -7,76 +7,133 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from mjx_balance.config import Config, RobotConfig, TaskConfig
+from mjx_balance.config import TaskConfig
+from mjx_balance.robots import Robot
 from mjx_balance.scene import ROBOT, Scene
-from mjx_balance.task.legs import foot_heights, joint_angles, ramp
+from mjx_balance.task.kinematics import foot_heights, joint_angles, ramp
 
-ROBOTS = (RobotConfig(), RobotConfig(calf=0.19), RobotConfig(thigh=0.18, calf=0.23))
+LINKS = ((0.213, 0.213), (0.213, 0.19), (0.18, 0.23))
+"""Thigh and calf, m."""
 
 
-def heights_of(robot: RobotConfig) -> np.ndarray:
+@pytest.fixture(params=LINKS, ids=str)
+def any_robot(robot: Robot, request: pytest.FixtureRequest) -> Robot:
+    """Robots with legs of other proportions too."""
+    thigh, calf = request.param
+    return dataclasses.replace(robot, thigh=thigh, calf=calf)
+
+
+def heights_of(robot: Robot) -> np.ndarray:
     """(25, 4) heights over the whole reach of the legs."""
     return np.linspace(*robot.height_range, 100).reshape(25, 4)
 
 
-def foot_sites(config: Config, scene: Scene, angles: np.ndarray) -> np.ndarray:
-    """(legs, 3) foot centres that MuJoCo sees from the trunk, m."""
+def posed(scene: Scene, angles: np.ndarray) -> mujoco.MjData:
+    """The robot upright with the given joint angles, addressed by name."""
     data = mujoco.MjData(scene.model)
-    data.qpos[scene.leg_qpos] = angles
+    for leg, name in enumerate(("LF", "RF", "LH", "RH")):
+        for k, joint in enumerate(("abduction", "hip", "knee")):
+            data.joint(f"{ROBOT}{name}_{joint}").qpos = angles[leg, k]
     mujoco.mj_kinematics(scene.model, data)
-    sites = [data.site(f"{ROBOT}{leg}_foot").xpos for leg in config.robot.legs]
+    return data
+
+
+def foot_sites(scene: Scene, angles: np.ndarray) -> np.ndarray:
+    """(legs, 3) foot centres that MuJoCo sees from the trunk, m."""
+    data = posed(scene, angles)
+    sites = [data.site(f"{ROBOT}{leg}_foot").xpos for leg in ("LF", "RF", "LH", "RH")]
     return np.asarray(sites) - data.body(f"{ROBOT}trunk").xpos
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
 def test_forward_inverts_inverse_over_the_whole_reach(
-    xp: types.ModuleType, robot: RobotConfig
+    xp: types.ModuleType, any_robot: Robot
 ) -> None:
-    heights = heights_of(robot)
-    got = foot_heights(robot, joint_angles(robot, xp.asarray(heights)))
+    heights = heights_of(any_robot)
+    got = foot_heights(any_robot, joint_angles(any_robot, xp.asarray(heights)))
     np.testing.assert_allclose(got, heights, atol=1e-6)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_the_reach_ends_at_the_knee_limits(robot: RobotConfig) -> None:
-    knee = joint_angles(robot, heights_of(robot))[..., 2].ravel()
-    assert (knee[0], knee[-1]) == pytest.approx((robot.knee_min, robot.knee_max))
+def test_the_reach_ends_at_the_knee_limits(any_robot: Robot) -> None:
+    knee = joint_angles(any_robot, heights_of(any_robot))[..., 2].ravel()
+    assert (knee[0], knee[-1]) == pytest.approx((any_robot.knee_min, any_robot.knee_max))
     assert (np.diff(knee) > 0).all(), "longer legs have straighter knees"
 
 
-def test_standing_angles_by_hand() -> None:
+def test_standing_angles_by_hand(robot: Robot) -> None:
     """0.328 m between two links of 0.213 m: each leans acos(0.164 / 0.213) = 0.6920 rad."""
-    angles = joint_angles(RobotConfig(), np.full(4, 0.35))
+    angles = joint_angles(robot, np.full(4, 0.35))
     np.testing.assert_allclose(angles, np.tile((0.0, 0.69203, -1.38406), (4, 1)), atol=1e-5)
 
 
-def test_a_straight_leg_is_both_links_and_the_foot_long() -> None:
-    assert foot_heights(RobotConfig(), np.zeros((4, 3))) == pytest.approx(0.448)
+def test_a_straight_leg_is_both_links_and_the_foot_long(robot: Robot) -> None:
+    assert foot_heights(robot, np.zeros((4, 3))) == pytest.approx(0.448)
 
 
-def test_forward_kinematics_agree_with_mujoco(config: Config, scene: Scene) -> None:
+def test_forward_kinematics_agree_with_mujoco(scene: Scene, robot: Robot) -> None:
     """Any angles, abduction to either side included."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         angles = rng.uniform((-1.0, -0.5, -2.7), (1.0, 2.0, -0.9), (4, 3))
-        below = -foot_sites(config, scene, angles)[:, 2] + config.robot.foot_radius
-        np.testing.assert_allclose(foot_heights(config.robot, angles), below, atol=1e-9)
+        below = -foot_sites(scene, angles)[:, 2] + robot.foot_radius
+        np.testing.assert_allclose(foot_heights(robot, angles), below, atol=1e-9)
 
 
-def test_abduction_moves_left_and_right_feet_opposite_ways() -> None:
+def test_abduction_moves_left_and_right_feet_opposite_ways(robot: Robot) -> None:
     """A straight leg abducted by 90 deg has its foot at the height of the hip offset."""
     angles = np.tile((np.pi / 2, 0.0, 0.0), (4, 1))
     expected = 0.022 + 0.0955 * np.asarray([-1, 1, -1, 1])
-    np.testing.assert_allclose(foot_heights(RobotConfig(), angles), expected, atol=1e-9)
+    np.testing.assert_allclose(foot_heights(robot, angles), expected, atol=1e-9)
 
 
-def test_feet_move_straight_up_and_down_under_their_hips(config: Config, scene: Scene) -> None:
+def test_feet_move_straight_up_and_down_under_their_hips(robot: Robot, scene: Scene) -> None:
     corners = np.asarray([(0.193, 0.142), (0.193, -0.142), (-0.193, 0.142), (-0.193, -0.142)])
     for height in (0.30, 0.35, 0.40):
-        feet = foot_sites(config, scene, joint_angles(config.robot, np.full(4, height)))
+        feet = foot_sites(scene, joint_angles(robot, np.full(4, height)))
         np.testing.assert_allclose(feet[:, :2], corners, atol=1e-9)
         np.testing.assert_allclose(feet[:, 2], 0.022 - height, atol=1e-9)
+
+
+def test_knees_bend_backward(scene: Scene, robot: Robot) -> None:
+    """Standing, a thigh leans back by 0.6920 rad: its knee is 0.1359 m behind the hip."""
+    data = posed(scene, joint_angles(robot, np.full(4, 0.35)))
+    for leg in ("LF", "RF", "LH", "RH"):
+        hip, knee = (data.body(f"{ROBOT}{leg}_{part}").xpos for part in ("thigh", "calf"))
+        np.testing.assert_allclose(knee - hip, (-0.135915, 0.0, -0.164), atol=1e-6)
+
+
+def test_out_of_reach_is_a_straight_leg_and_a_number(xp: types.ModuleType, robot: Robot) -> None:
+    """A straight leg of 0.426 m; a foot that is told to go further stays straight."""
+    angles = joint_angles(robot, xp.asarray([0.6, 0.448, 0.35, 0.6]))
+    np.testing.assert_allclose(np.asarray(angles)[[0, 1, 3]], 0.0, atol=2e-3)
+    assert np.isfinite(angles).all()
+
+
+@settings(deadline=None, max_examples=50)
+@given(share=st.floats(0.001, 1.0), ratio=st.integers(1, 60), data=st.data())
+def test_ramp_is_a_walk_of_equal_steps(share: float, ratio: int, data: st.DataObject) -> None:
+    """Equal steps until the share of the decision is over, at least one step; then rest."""
+    task = TaskConfig(sim_dt=0.01, ctrl_dt=0.01 * ratio, action_ramp=share)
+    heights = st.lists(st.floats(0.2, 0.4), min_size=4, max_size=4)
+    before, after = np.asarray(data.draw(heights)), np.asarray(data.draw(heights))
+    moving = max(1, round(share * ratio))
+    walk, at = [], before
+    for k in range(ratio):
+        at = at + (after - before) / moving if k < moving else after
+        walk.append(at)
+    got = ramp(task, before, after)
+    np.testing.assert_allclose(got, walk, atol=1e-12)
+    np.testing.assert_array_equal(got[moving - 1 :], np.tile(after, (ratio - moving + 1, 1)))
+
+
+def test_single_precision_stays_single(robot: Robot) -> None:
+    """A float64 that slips in would double the memory of every env."""
+    heights = np.full((3, 4), 0.35, np.float32)
+    assert ramp(TaskConfig(), heights, heights).dtype == np.float32
+    assert joint_angles(robot, heights).dtype == np.float32
+    assert foot_heights(robot, joint_angles(robot, heights)).dtype == np.float32
 
 
 def test_ramp_is_a_line_then_rest(xp: types.ModuleType) -> None:
@@ -105,8 +162,8 @@ def test_ramps_of_a_batch_equal_a_loop(xp: types.ModuleType) -> None:
     np.testing.assert_allclose(ramp(TaskConfig(), before, after), np.stack(loop))
 
 
-def test_numpy_and_jax_agree() -> None:
-    robot, heights = RobotConfig(), heights_of(RobotConfig())[1:]
+def test_numpy_and_jax_agree(robot: Robot) -> None:
+    heights = heights_of(robot)[1:]
     angles = joint_angles(robot, heights)
     np.testing.assert_allclose(joint_angles(robot, jnp.asarray(heights)), angles, atol=2e-6)
     angles[..., 0] = np.linspace(-1, 1, 4)

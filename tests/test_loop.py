@@ -104,7 +104,13 @@ def test_a_plan_rounds_the_run_up_to_whole_calls() -> None:
 def test_every_call_is_logged_and_the_end_is_saved(
     folder: RunFolder, display: Display, stop: Interrupts
 ) -> None:
-    state, seconds = learn(PLAN, step, start(), folder, display, stop)  # pyright: ignore
+    def program(state: Any) -> Any:
+        """Whoever watches the file sees every line at once."""
+        assert len(logged(folder)) == int(state.env_steps) // 20
+        return step(state)
+
+    zero: Any = start()
+    state, seconds = learn(PLAN, program, zero, folder, display, stop)
     assert float(state.weights) == 31  # ((((0*2+1)*2+1)*2+1)*2+1)*2+1
     assert [line["env_steps"] for line in logged(folder)] == [20, 40, 60, 80, 100]
     assert [line["gradient_steps"] for line in logged(folder)] == [3, 6, 9, 12, 15]
@@ -300,14 +306,17 @@ def test_an_interrupt_is_answered_while_the_call_goes_on(number: int) -> None:
         time.sleep(2.5 * loop.ANSWER_S)  # and not said again
         return argument + 1
 
-    before = signal.getsignal(number)
+    def handler(number: int, frame: object) -> None:
+        pytest.fail("not this one")
+
+    before = signal.signal(number, handler)
     with Interrupts(say) as stop:
         assert not stop
         assert stop.run(call, 1) == 2
         assert stop
+    assert signal.signal(number, before) is handler
     assert len(said) == 1
     assert said[0].startswith("stopping after this call and saving; interrupt again to quit")
-    assert signal.getsignal(number) is before
 
 
 def test_a_second_interrupt_does_not_wait_for_the_call(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,13 +13,12 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_balance.config import Config, flatten, preset, to_dict
+from mjx_balance.sources import code
 from mjx_balance.training import devices, program_cache
 from mjx_balance.training.program_cache import (
     NOT_TRACED,
-    PACKAGE,
     compile_program,
     program_key,
-    sources,
 )
 
 ROOT = devices.__name__
@@ -169,7 +168,7 @@ def test_the_same_run_has_the_same_key_and_another_seed_too() -> None:
 
 
 def test_every_other_number_changes_the_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program_cache, "sources", lambda root: [])  # the same for all
+    monkeypatch.setattr(program_cache, "code", lambda root: {})  # the same for all
     keys = {key(), key(iterations=17)}
     values = to_dict(CONFIG)
     places = [((name,), value) for name, value in values.items() if not isinstance(value, dict)]
@@ -222,45 +221,47 @@ def test_a_library_and_a_device_change_the_key(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_code_that_is_traced_is_found_and_no_other() -> None:
-    found = {str(path.relative_to(PACKAGE)) for path in sources(ROOT)}
-    traced = "env.py dqn/learner.py dqn/losses.py dqn/networks.py dqn/replay.py task/reward.py"
-    assert set(traced.split()) | {"scene.py", "config.py", "training/devices.py"} <= found
-    assert {"task/__init__.py", "task/tilt.py", "training/program_cache.py"} <= found
-    others = ("cli", "display", "evaluation", "render", "training/finish", "training/loop")
-    assert not found & {f"{name}.py" for name in others}
-    assert not [name for name in found if name.startswith(("report", "figures"))]
+    found = {name.removeprefix("mjx_balance.") for name in code(ROOT)}
+    traced = "env engines.mjx scene config task task.reward task.decision training.devices"
+    traced += " dqn.learner dqn.updating dqn.collecting dqn.losses dqn.networks dqn.replay"
+    assert set(traced.split()) <= found
+    others = "cli display evaluation render controllers report training.finish training.loop"
+    assert not found & set(others.split())
+    assert not [name for name in found if name.startswith("report")]
 
 
 def test_an_edit_of_what_is_traced_changes_the_key_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    package = tmp_path / "pkg"
+    package = tmp_path / "copy"
     (package / "inner").mkdir(parents=True)
     files = {
-        "root.py": "from pkg.inner.deep import f\nimport pkg.direct as d\nimport os",
+        "root.py": "from mjx_balance.inner.deep import f\nimport mjx_balance.direct, os",
         "direct.py": "x = 1",
         "inner/__init__.py": "",
-        "inner/deep.py": "def f():\n    from pkg import lazy\n",
-        "lazy.py": "from pkg import root",
-        "report.py": "from pkg import root",
+        "inner/deep.py": "def f():\n    from mjx_balance import lazy\n",
+        "lazy.py": "from mjx_balance import root",
+        "report.py": "from mjx_balance import root",
     }
     for name, text in files.items():
         (package / name).write_text(text)
     (tmp_path / "scenes").mkdir()
     scene = tmp_path / "scenes" / "robot.xml"
     scene.write_text("<mujoco/>")
-    monkeypatch.setattr(program_cache, "PACKAGE", package)
+    found = code("mjx_balance.root", package)
+    names = sorted(name.removeprefix("mjx_balance.") for name in found)
+    assert names == ["direct", "inner", "inner.deep", "lazy", "root"]
+    monkeypatch.setattr(program_cache, "code", lambda root: code(root, package))
     monkeypatch.setattr(program_cache, "scene_dir", lambda: tmp_path / "scenes")
-    names = [str(path.relative_to(package)) for path in sources("pkg.root")]
-    assert names == ["direct.py", "inner/deep.py", "lazy.py", "root.py"]
 
     def today() -> str:
-        return program_key(CONFIG, 1, "pkg.root")
+        return program_key(CONFIG, 1, "mjx_balance.root")
 
     before = today()
-    (package / "report.py").write_text("changed")
+    (package / "report.py").write_text("changed = 1")
+    (package / "lazy.py").write_text("from mjx_balance import root  # a comment")
     assert today() == before
     for file in (package / "lazy.py", scene):
-        file.write_text(file.read_text() + " ")
+        file.write_text(f"{file.read_text()}\ny = 2")
         assert today() != before
         before = today()

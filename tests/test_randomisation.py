@@ -1,118 +1,145 @@
-"""Domain randomisation in MJX: the same circumstances as in plain MuJoCo."""
+"""Domain randomisation in MJX: what differs from env to env, and by how much."""
 
-import dataclasses
+import itertools
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
+from fleet import ENVS, STAND, Fleet, keys, nominal, under
 
-from mjx_balance.config import Config, RandomConfig, preset
-from mjx_balance.env import BalanceEnv
-from mjx_balance.evaluation import roll_out
-from mjx_balance.task.actions import action_table, apply_action
-from mjx_balance.task.conditions import Conditions
-from mjx_balance.task.tilt import Scenario
+from mjx_balance.task.observation import observation_names
+from mjx_balance.task.randomization import Conditions
 
-ENVS, DECISIONS = 32, 4
-RANDOM = RandomConfig(
-    gyro_noise=0.002,
-    accel_noise=0.023,
-    payload=5.0,
-    friction_min=0.6,
-    friction_max=1.0,
-    gain_spread=0.2,
-    latency_share=0.5,
-    rate_max=4.4,
-    incline_max=9.0,
-)
+MANY = 4_000
 
 
 @pytest.fixture(scope="module")
-def config() -> Config:
-    default = preset("default")
-    task = dataclasses.replace(default.task, command_lags=(0,))
-    return dataclasses.replace(default, random=RANDOM, task=task)
+def drawn(fleet: Fleet) -> tuple[Conditions, Any]:
+    """Circumstances and scenarios of many resets."""
+
+    def draw(key: jax.Array) -> Any:
+        info = fleet.env.reset(key).info
+        return info["conditions"], info["scenario"]
+
+    return jax.device_get(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), MANY)))
+
+
+def test_circumstances_fill_their_ranges(drawn: tuple[Conditions, Any]) -> None:
+    conditions, _ = drawn
+    ranges = {
+        "payload": (conditions.payload, 0, 5),
+        "x": (conditions.payload_at[:, 0], -0.05, 0.05),
+        "y": (conditions.payload_at[:, 1], -0.05, 0.05),
+        "friction": (conditions.friction, 0.4, 1.0),
+        "gain": (conditions.gain, 0.8, 1.2),
+    }
+    for name, (values, low, high) in ranges.items():
+        test = scipy.stats.kstest(values, "uniform", (low, high - low))
+        assert test.pvalue > 1e-3, name
+    np.testing.assert_allclose(conditions.payload_at[:, 2], 0.08, rtol=1e-6)
+    assert set(conditions.latency) == {0, 1}
+    assert conditions.latency.mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(MANY))
+    sigma = np.asarray([0.002] * 3 + [0.023] * 3, np.float32)
+    np.testing.assert_allclose(conditions.imu_noise, np.tile(sigma, (MANY, 1)))
+
+
+def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any]) -> None:
+    """A key used twice would tie a payload to a target."""
+    conditions, scenario = drawn
+    columns = np.column_stack(
+        (
+            conditions.payload,
+            conditions.payload_at[:, :2],
+            conditions.friction,
+            conditions.gain,
+            conditions.latency,
+            scenario.targets[:, 1],
+            np.linalg.norm(scenario.targets[:, 1], axis=-1),
+            scenario.phase,
+        )
+    )
+    together = scipy.stats.spearmanr(columns).statistic - np.eye(columns.shape[1])
+    assert np.abs(together).max() < 0.07
+
+
+SIGMA = np.linspace(0.5, 2, ENVS)[:, None] * np.asarray((0.001, 0.002, 0.003, 0.02, 0.04, 0.06))
+"""(ENVS, 6) noise of every env and channel, no two alike."""
 
 
 @pytest.fixture(scope="module")
-def episode(config: Config):
-    """Start, actions and (state, tilt) of a few decisions of small random moves."""
-    env = BalanceEnv(config)
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), ENVS))
-    levels = np.random.default_rng(0).integers(7, 14, (DECISIONS, ENVS, 2))
-    actions = levels[..., 0] * 21 + levels[..., 1]
-
-    def step(state, action):
-        after = jax.vmap(env.step)(state, action)
-        return after, after.metrics["tilt_deg"]
-
-    end, tilt = jax.jit(lambda s, a: jax.lax.scan(step, s, a))(state, jnp.asarray(actions))
-    return env, jax.device_get(state), actions, jax.device_get(end), np.asarray(tilt)
-
-
-def test_every_env_has_its_own_circumstances(episode) -> None:
-    _, start, *_ = episode
-    conditions, scenario = start.info["conditions"], start.info["scenario"]
-    for name, least, most in (("payload", 0, 5), ("friction", 0.6, 1.0), ("gain", 0.8, 1.2)):
-        values = getattr(conditions, name)
-        assert len(np.unique(values)) == ENVS
-        assert values.min() >= least
-        assert values.max() <= most
-        assert np.ptp(values) > 0.8 * (most - least)
-    assert 0.2 < conditions.latency.mean() < 0.8
-    assert 3.5 <= scenario.rate.min() < 3.7 < 4.2 < scenario.rate.max() <= 4.4
-    assert 7 < np.linalg.norm(scenario.targets, axis=-1).max() < 9 * 2**0.5
+def noise(fleet: Fleet) -> tuple[np.ndarray, list[Any], list[Any]]:
+    """Noise (2, ENVS, 50, 6) of two decisions in units of its size, with and without it."""
+    loud = nominal()._replace(imu_noise=SIGMA.astype(np.float32))
+    runs = []
+    for conditions in (nominal(), loud):
+        state, states = under(fleet.reset(keys(4)), conditions), []
+        for _ in range(2):
+            state = fleet.step(state, np.full(ENVS, STAND))
+            states.append(jax.device_get(state))
+        runs.append(states)
+    clean, noisy = runs
+    imu = [np.asarray([s.info["memory"].imu for s in states], float) for states in runs]
+    return (imu[1] - imu[0]) / SIGMA[:, None], clean, noisy
 
 
-def test_mjx_moves_as_plain_mujoco_in_the_same_circumstances(config: Config, episode) -> None:
-    """Payload, friction, gains, latency and board speed, all at once: equal tilts."""
-    env, start, actions, _, tilt = episode
-    double = {k: np.asarray(v, float) for k, v in start.info["conditions"]._asdict().items()}
-    rollout = roll_out(
-        env.scene,
-        config,
-        lambda view: actions[view.decision],
-        Scenario(*(np.asarray(x, float) for x in start.info["scenario"])),
-        DECISIONS * config.task.ctrl_dt,
-        conditions=Conditions(**double),
+def test_noise_is_normal_and_of_the_size_asked_for(noise: Any) -> None:
+    """Per channel 3,200 numbers: standard errors are 0.018 of the mean, 0.0125 of the size."""
+    z = noise[0]
+    assert z.shape == (2, ENVS, 50, 6)
+    for channel in range(6):
+        values = z[..., channel].ravel()
+        assert abs(values.mean()) < 0.07
+        assert values.std() == pytest.approx(1, abs=0.05)
+        assert abs(scipy.stats.kurtosis(values)) < 0.4
+    # And of every env, 600 numbers.
+    np.testing.assert_allclose(z.std(axis=(0, 2, 3)), 1, atol=0.12)
+
+
+def test_noise_is_white_and_new_for_every_env_decision_and_channel(noise: Any) -> None:
+    z = noise[0]
+
+    def together(a: np.ndarray, b: np.ndarray) -> float:
+        return abs(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+
+    assert together(z[0], z[1]) < 0.05
+    for lag in (1, 2, 5, 25):
+        assert together(z[:, :, lag:], z[:, :, :-lag]) < 0.05
+    for a, b in itertools.combinations(range(6), 2):
+        assert together(z[..., a], z[..., b]) < 0.08
+    for env in range(ENVS - 1):
+        assert together(z[:, env], z[:, env + 1]) < 0.2
+
+
+def test_noise_is_seen_and_moves_nobody(fleet: Fleet, noise: Any) -> None:
+    _, clean, noisy = noise
+    names = np.asarray(observation_names(fleet.env.config.task, fleet.env.scene.robot))
+    for a, b in zip(clean, noisy, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, a.pipeline_state, b.pipeline_state)
+        np.testing.assert_array_equal(a.reward, b.reward)
+        difference = b.obs - a.obs
+        heights = np.char.startswith(names, "H_") | np.char.startswith(names, "C_")
+        np.testing.assert_array_equal(difference[:, heights], 0 * difference[:, heights])
+        # The newest five samples of the roll rate, in deg/s.
+        rate = (b.info["memory"].imu - a.info["memory"].imu)[:, -5:, 0].mean(axis=1)
+        entry = list(names).index("V_x,t-0")
+        np.testing.assert_allclose(difference[:, entry], np.degrees(rate), atol=1e-4)
+
+
+def test_envs_of_a_batch_move_in_their_own_circumstances(fleet: Fleet) -> None:
+    """Two payloads, gains and soles under one scenario: each is where it is alone."""
+    state = fleet.reset(keys(9))
+    drawn = jax.device_get(state.info["conditions"])
+    turned = [np.roll(x, 1, axis=0) for x in drawn]
+    scenario = jax.tree.map(lambda x: np.repeat(np.asarray(x)[:1], ENVS, 0), state.info["scenario"])
+    state = state.replace(info=state.info | {"scenario": scenario})
+    actions = np.full(ENVS, STAND + 42)
+    first, second = (
+        jax.device_get(fleet.step(under(state, conditions), actions)).pipeline_state.qpos
+        for conditions in (drawn, Conditions(*turned))
     )
-    plain = rollout.tilt.reshape(ENVS, DECISIONS, -1).mean(axis=-1).T
-    difference = np.abs(plain - tilt)
-    assert np.median(difference) < 0.01
-    assert difference.max() < 0.15
-    nominal = roll_out(
-        env.scene,
-        config,
-        lambda view: actions[view.decision],
-        Scenario(*(np.asarray(x, float) for x in start.info["scenario"])),
-        DECISIONS * config.task.ctrl_dt,
-    )
-    other = nominal.tilt.reshape(ENVS, DECISIONS, -1).mean(axis=-1).T
-    assert np.median(np.abs(other - tilt)) > 0.03, "the circumstances matter"
-
-
-def test_noise_reaches_the_observation(episode) -> None:
-    env, _, _, end, _ = episode
-    imu = end.info["imu"]
-    # Yaw rate at the decision's end, curvature only: the motion itself is smooth.
-    jitter = np.diff(imu[:, -8:, 2], n=2, axis=1) / np.sqrt(6)
-    assert jitter.std() == pytest.approx(0.002, rel=0.25)
-    newest = imu[:, -1, 3] / env.config.task.accel_scale
-    np.testing.assert_allclose(end.obs[:, 20], newest, rtol=1e-5)
-
-
-def test_a_late_robot_is_told_its_command_at_once_and_obeys_one_decision_later(episode) -> None:
-    env, start, actions, end, _ = episode
-    task = env.config.task
-    change = action_table(task)[actions]
-    heights = late = np.asarray(start.info["heights"])
-    for k in range(DECISIONS):
-        late, heights = heights, apply_action(task, env.config.robot, heights, change[k])
-    np.testing.assert_allclose(end.info["commanded"][:, -1], heights, atol=1e-6)
-    is_late = start.info["conditions"].latency[:, None] > 0
-    np.testing.assert_allclose(end.info["heights"], np.where(is_late, late, heights), atol=1e-6)
-    told = (heights - task.body_height) / task.height_scale
-    np.testing.assert_allclose(end.obs[:, 4:8], told, atol=1e-4)
-    measured = task.body_height + end.obs[:, :4] * task.height_scale
-    assert np.abs(measured - end.info["heights"]).max() < 0.002
+    np.testing.assert_allclose(np.roll(first, 1, axis=0), second, atol=1e-6)
+    height = first[:, fleet.env.scene.trunk_quat[0] - 1]
+    assert len(np.unique(height)) == ENVS
+    assert np.ptp(height) > 1e-4

@@ -1,23 +1,28 @@
 """The HTML report: complete, honest about what is missing, and quiet in a browser."""
 
+import base64
+import copy
 import dataclasses
-import io
+import html
 import json
 import re
 import shutil
 import subprocess
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from rich.console import Console
 
-from mjx_balance import figures, report
 from mjx_balance.cli import main
 from mjx_balance.config import Config, preset, to_dict
-from mjx_balance.policy import make_manifest, save_policy
+from mjx_balance.evaluation import Envelope
+from mjx_balance.policy import Policy, load_policy, make_manifest, save_policy
+from mjx_balance.report import figures, measuring, page, reading
+from mjx_balance.report.measuring import Measured
+from mjx_balance.report.reading import Run
 from mjx_balance.scene import Scene
 
 ISOLATED = '"network_isolation_key":"file://'
@@ -26,6 +31,7 @@ SHORTER = {
     "DURATION": 3.0,
     "ENVELOPE_SCENARIOS": 1,
     "ENVELOPE_DURATION": 1.0,
+    "RECORD_SECONDS": 12.0,
     "VIDEO_SECONDS": 1.0,
 }
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -68,27 +74,27 @@ def run(config: Config, scene: Scene, tmp_path_factory: pytest.TempPathFactory) 
         for name, a, b in (("hidden_0", 34, 64), ("hidden_1", 64, 64), ("head", 98, 3))
     }
     layers |= {"profile": np.zeros(4), "stretch": np.zeros(2)}
-    manifest = make_manifest(config, scene.hash, (21, 21), {})
+    manifest = make_manifest(config, scene.hash, {})
     save_policy(folder / "policy.safetensors", {"params": layers}, manifest)
     return folder
 
 
 @pytest.fixture(scope="module")
-def page(run: Path) -> Path:
+def written(run: Path) -> Path:
     """The report on that folder, by the command."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in SHORTER.items():
-            patch.setattr(report, name, value)
+            patch.setattr(measuring, name, value)
         assert main(("report", str(run), "--scenarios", "2")) == 0
     return run / "report.html"
 
 
-def test_everything_is_there(page: Path) -> None:
-    text = page.read_text()
+def test_everything_is_there(written: Path) -> None:
+    text = written.read_text()
     titles = re.findall(r"<h2>(.*?)</h2>", text)
     expected = (
-        "Against the baselines|Over the training seeds|100 s on the board: paper|"
-        "100 s on the board: corner|Tilt distribution|Envelope|Video|Learning curves|"
+        "Against the baselines|Over the training seeds|12 s on the board: paper|"
+        "12 s on the board: corner|Tilt distribution|Envelope|Video|Learning curves|"
         "Reward (Fig. 4 and 5 of the paper)|Config|Reproduce"
     )
     assert titles == expected.split("|"), "nothing is missing"
@@ -101,29 +107,208 @@ def test_everything_is_there(page: Path) -> None:
     assert "data:video/mp4;base64," in text
 
 
-def test_the_page_needs_nothing_from_elsewhere(page: Path) -> None:
-    text = re.sub(r'"data:[^"]*"', '""', page.read_text())
+class Tables(HTMLParser):
+    """The text of every cell of every table of a page: [table][row][cell]."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[list[list[str]]] = []
+        self.inside = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        if tag == "table":
+            self.found.append([])
+        elif tag == "tr":
+            self.found[-1].append([])
+        elif tag in ("td", "th"):
+            self.found[-1][-1].append("")
+            self.inside = True
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside = self.inside and tag not in ("td", "th")
+
+    def handle_data(self, data: str) -> None:
+        if self.inside:
+            self.found[-1][-1][-1] += data
+
+
+BLANK = {"comparison": None, "seeds": None, "pictures": [], "video": None, "training": []}
+BLANK |= {"title": "x", "missing": [], "config": None, "commands": [], "versions": None}
+
+
+def made_up(policy: Policy) -> Measured:
+    """A measurement in which every number is another one."""
+    results: dict[str, Any] = {}
+    for k, name in enumerate(("policy", *page.SEES)):
+        results[name] = {}
+        for n, suite in enumerate(("paper", "corner")):
+            first = k + n / 2
+            tilt = {"mean": first + 0.1, "p95": first + 0.2, "max": first + 0.3}
+            results[name][suite] = {
+                "scenarios": 40 + n,
+                "falls": 10 * k + n,
+                "tilt_deg": tilt | {"rms": 9.9, "p50": 9.8, "p99": 9.7},
+                "action_mm_settled": None if k == 1 else 0.01 * k + n,
+            }
+    shares = {name: {"paper": [0.5] + [0.0] * 160 + [0.5]} for name in results}
+    envelope = Envelope(
+        inclines=[2.0, 3.0, 20.0],
+        rates=[2.5, 3.0, 9.0],
+        fall_rate=[[0.0, 0.0, 1.0], [0.0, 0.5, 1.0], [1.0, 1.0, 1.0]],
+        mean_tilt=[[0.1] * 3] * 3,
+        authority=4.456,
+        reach=10.34,
+        scenarios=3,
+        duration_s=31.0,
+        seed=0,
+    )
+    return Measured(results, shares, envelope)
+
+
+def test_the_table_of_baselines_and_the_tiles(run: Path) -> None:
+    policy = load_policy(run / "policy.safetensors")
+    shown = page.comparison(policy, made_up(policy))
+    text = page.render_page(BLANK | {"comparison": shown})
+    (table,) = Tables(text).found
+    assert table[0] == ["", "sees", "suite paper", "suite corner", "moves at restmm"]
+    assert table[1] == ["falls", "mean", "p95", "max"] * 2
+    names = "policy none pd-imu pd-attitude rate-oracle clairvoyant"
+    assert [row[0] for row in table[2:]] == names.split()
+    assert table[2][1:] == [
+        "this network: 34 inputs",
+        *("0", "0.100", "0.200", "0.300"),
+        *("1", "0.600", "0.700", "0.800"),
+        "0.000",
+    ]
+    assert table[3][1:] == [
+        "stands still",
+        *("10", "1.100", "1.200", "1.300"),
+        *("11", "1.600", "1.700", "1.800"),
+        "-",
+    ]
+    assert table[7][2:] == "50 5.100 5.200 5.300 51 5.600 5.700 5.800 0.050".split()
+    assert text.count('class="ours"') == 1
+    assert '<tr class="ours"><td><b>policy</b>' in text
+    assert re.findall(r"<div><b>(.*?)</b><span>(.*?)</span></div>", text) == [
+        ("0.100°", "mean tilt, targets in any direction"),
+        ("0.600°", "mean tilt, both axes at 7° at once"),
+        ("1", "falls in 80 scenarios of 60 s"),
+        ("75%", "of the feasible envelope free of falls"),
+    ]
+    assert "Plain MuJoCo, 40 held-out scenarios of 60 s per suite (seed 4000000)" in text
+
+
+def test_the_pictures_of_a_policy_and_their_captions(
+    run: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: dict[str, Any] = {}
+    for name in ("rollout_figure", "tilt_figure", "envelope_figure"):
+        monkeypatch.setattr(figures, name, lambda *given, name=name: (name, given))
+    monkeypatch.setattr(figures, "png", lambda figure: repr(figure[0]).encode())
+    monkeypatch.setattr(measuring, "recorded", lambda *given: given)
+    policy = load_policy(run / "policy.safetensors")
+    pictures = page.policy_pictures(policy, scene, made_up(policy))
+    assert [picture.title for picture in pictures] == [
+        "100 s on the board: paper",
+        "100 s on the board: corner",
+        "Tilt distribution",
+        "Envelope",
+    ]
+    drawn = {picture.title: base64.b64decode(picture.png).decode() for picture in pictures}
+    assert list(drawn.values()) == [
+        "'rollout_figure'",
+        "'rollout_figure'",
+        "'tilt_figure'",
+        "'envelope_figure'",
+    ]
+    assert "suite corner (both axes at once" in pictures[1].caption
+    assert pictures[3].caption.startswith("Targets on both axes at once, 3 scenarios of 31 s per")
+    assert "3 mm five times a second turn the body at 4.46 deg/s" in pictures[3].caption
+    assert "the legs reach 10.3 deg. Inside, 75% of the cells" in pictures[3].caption
+
+
+def test_the_seeds_of_alike_runs_are_put_together(config: Config) -> None:
+    def run_of(name: str, config: Config | None, *tilts: float) -> Run:
+        results = [
+            {suite: evaluation_result(suite, t + n) for n, suite in enumerate(("paper", "corner"))}
+            for t in tilts
+        ]
+        return Run(Path(name), config=config, results=results)
+
+    first = run_of("a", config, 0.1)
+    more = run_of("b", dataclasses.replace(config, seed=7, num_seeds=2), 0.4, 0.2)
+    dqn = dataclasses.replace(config.dqn, gamma=0.9)
+    other = run_of("c", dataclasses.replace(config, dqn=dqn), 5.0)
+    unknown = run_of("d", None, 6.0)
+    shown = page.seeds_table(first, [other, first, more, unknown])
+    (table,) = Tables(page.render_page(BLANK | {"seeds": shown})).found
+    heads = "suite|seeds|falls|mean|worst seed|p95|worst seed|max|worst seed"
+    assert table[0] == heads.split("|")
+    three = ["0.233 (0.100-0.400)", "0.400"]
+    assert table[1] == ["paper", "3", "3 of 24", *three * 3]
+    assert table[2] == ["corner", "3", "3 of 24", *["1.233 (1.100-1.400)", "1.400"] * 3]
+    assert page.seeds_table(first, [first, other]) is None, "one seed needs no statistics"
+    more.results[0].pop("corner")
+    shown = page.seeds_table(first, [first, more])
+    assert shown is not None
+    assert [suite for suite, _ in shown["rows"]] == ["paper"], "what every seed was tried on"
+
+
+def test_the_config_table_shows_what_differs_from_the_papers(config: Config) -> None:
+    dqn = dataclasses.replace(preset("paper").dqn, gamma=0.77)
+    config = dataclasses.replace(preset("paper"), dqn=dqn, seed=3)
+    text = page.render_page(BLANK | {"config": page.config_tables(config)})
+    (table,) = Tables(text).found
+    assert table == [
+        ["field", "preset paper", "this run"],
+        ["seed", "0", "3"],
+        ["gamma", "0.1", "0.77"],
+    ]
+    everything = re.findall(r"<details>.*?<pre>(.*?)</pre>", text, re.DOTALL)[0]
+    assert json.loads(html.unescape(everything)) == to_dict(config)
+
+
+def test_the_commands_make_everything_again(run: Path, config: Config) -> None:
+    policy = load_policy(run / "policy.safetensors")
+    runs = [
+        Run(Path("a"), config=config, policy=policy),
+        Run(Path("b"), policy=policy),
+        Run(Path("c")),
+    ]
+    assert page.commands(runs, Path("out.html")) == [
+        "mjx-balance train --preset default --seed 0",
+        "mjx-balance evaluate a/policy.safetensors --suite corner",
+        "mjx-balance evaluate b/policy.safetensors --suite corner",
+        "mjx-balance report a b c --out out.html",
+    ]
+
+
+def test_the_reward_is_said_to_be_taken_where_it_is(config: Config) -> None:
+    for where, said in (
+        ("end", "taken at the decision's end."),
+        ("mean", "taken averaged over it."),
+    ):
+        task = dataclasses.replace(config.task, reward_tilt=where)
+        (picture,) = page.training_pictures([], dataclasses.replace(config, task=task))
+        assert picture.caption.endswith(said)
+
+
+def test_the_page_needs_nothing_from_elsewhere(written: Path) -> None:
+    text = re.sub(r'"data:[^"]*"', '""', written.read_text())
     assert not re.findall(r"(?:src|href)=\"[^\"]+\"", text)
     assert "http" not in text
     assert "<script" not in text
 
 
-def test_measurements_are_kept_and_read_back(
-    run: Path, page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = json.loads((run / "report.json").read_text())
-    for suites in data["results"].values():
-        assert {r["scenarios"] for r in suites.values()} == {2}
-    for suites in data["histogram"].values():
-        for share in suites.values():
-            assert sum(share) == pytest.approx(1.0)
-    shutil.copy(run / "policy.safetensors", tmp_path)
-    data["results"]["pd-imu"]["corner"]["tilt_deg"]["p95"] = 0.424
-    (tmp_path / "report.json").write_text(json.dumps(data))
-    for name, value in SHORTER.items():
-        monkeypatch.setattr(report, name, value)
-    assert main(("report", str(tmp_path), "--scenarios", "2")) == 0
-    assert "<td>0.424</td>" in (tmp_path / "report.html").read_text()
+def test_what_is_shown_is_what_was_measured_and_kept(run: Path, written: Path) -> None:
+    results = json.loads((run / "report.json").read_text())["results"]
+    rows = Tables(written.read_text()).found[0][2:]
+    for row, suites in zip(rows, results.values(), strict=True):
+        measured = [suites[suite] for suite in ("paper", "corner")]
+        assert {result["scenarios"] for result in measured} == {2}
+        shown = [f"{r['tilt_deg'][x]:.3f}" for r in measured for x in ("mean", "p95", "max")]
+        assert [*row[3:6], *row[7:10]] == shown
 
 
 def test_an_incomplete_folder_says_what_is_missing_and_shows_the_rest(
@@ -144,41 +329,6 @@ def test_an_incomplete_folder_says_what_is_missing_and_shows_the_rest(
     assert "<h2>Config</h2>" in text
 
 
-GOOD_LINE = json.dumps(metrics_line(0, 1))
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("config.json", "[]", "config.json cannot be used: Config is []; it must map"),
-        ("config.json", '{"task": []}', "config.json cannot be used: TaskConfig is []"),
-        ("config.json", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a number"),
-        ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_st', "metrics.jsonl is shown up to line 2"),
-        ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_steps": 9}}', "it has no 'train/tilt_deg'"),
-        ("metrics.jsonl", f"{GOOD_LINE}\n5", "metrics.jsonl is shown up to line 2"),
-        ("seeds.json", '{"best": 1}', "seeds.json cannot be used: it has no 'seeds'"),
-        ("seeds.json", "[1]", "seeds.json cannot be used"),
-        ("evaluation.json", '{"paper": {"falls": 0}}', "evaluation.json cannot be used: it has no"),
-        ("evaluation.json", '{"paper": 1}', "evaluation.json cannot be used"),
-    ],
-)
-def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_read(
-    tmp_path: Path, name: str, content: str, said: str
-) -> None:
-    (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
-    (tmp_path / name).write_text(content)
-    run = report.read_run(tmp_path)
-    assert said in "\n".join(run.missing)
-    assert run.metrics == [metrics_line(0, 1)]
-
-
-def test_metrics_without_a_line_are_said(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text("{}")
-    (tmp_path / "metrics.jsonl").write_text("")
-    said = "\n".join(report.read_run(tmp_path).missing)
-    assert "metrics.jsonl cannot be used: it holds no line yet" in said
-
-
 def test_a_folder_with_somebody_elses_config_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,37 +338,88 @@ def test_a_folder_with_somebody_elses_config_is_refused(
     assert [p.name for p in tmp_path.iterdir()] == ["config.json"]
 
 
-def test_runs_that_log_at_other_intervals_share_one_axis() -> None:
-    often = [metrics_line(k, 1) for k in range(8)]
-    figure = figures.learning_curves([often, often[1::2]])
-    line = figure.axes[0].get_lines()[0]
-    np.testing.assert_allclose(np.asarray(line.get_xdata()), 1.024 * np.arange(1, 9))
-    both = np.asarray(line.get_ydata())[1::2]
-    np.testing.assert_allclose(both, [m["train/tilt_deg"] for m in often[1::2]])
-
-
 def test_the_command_gives_every_field_that_the_preset_does_not() -> None:
     best = preset("best")
     dqn = dataclasses.replace(best.dqn, gamma=0.77, mirror=False, hidden_sizes=(8, 9))
-    command = report._train_command(dataclasses.replace(best, dqn=dqn, num_envs=64))
+    command = page.train_command(dataclasses.replace(best, dqn=dqn, num_envs=64))
     assert command == (
         "mjx-balance train --preset best --seed 0 --num-envs 64 --gamma 0.77 --hidden-sizes 8 9 "
         "--no-mirror"
     )
 
 
-def test_tables_fit_an_80_column_terminal() -> None:
-    spread = {"iqm": 0.0684, "low": 0.0677, "high": 1.0687}
-    row = {"seeds": 5, "falls": 1280, "mean": spread, "p95": spread, "max": spread}
-    out = io.StringIO()
-    console = Console(width=80, file=out)
-    console.print(report.seeds_table({"friction": row}))
-    result = evaluation_result("friction", 0.1) | {"scenarios": 100_000, "duration_s": 60.0}
-    console.print(report.evaluation_table({"friction": result | {"action_mm_mean": 0.2}}))
-    text = out.getvalue()
-    assert text.count("0.068 (0.068-1.069)") == 3
-    assert "100000 x 60 s" in text
-    assert "…" not in text
+HOSTILE = "\"'><img src=x onerror=alert(1)><script>alert(2)</script>{{ 7 * 7 }}"
+
+
+def test_nothing_that_the_template_is_given_becomes_html() -> None:
+    rows = [(HOSTILE, HOSTILE, [HOSTILE])]
+    pair = [(HOSTILE, HOSTILE)]
+    picture = page.Picture(HOSTILE, HOSTILE, HOSTILE)
+    text = page.render_page(
+        {
+            "title": HOSTILE,
+            "missing": [HOSTILE],
+            "comparison": {"tiles": pair, "suites": [HOSTILE], "rows": rows, "note": HOSTILE},
+            "seeds": {"names": [HOSTILE], "rows": [(HOSTILE, [HOSTILE])]},
+            "pictures": [picture],
+            "video": HOSTILE,
+            "video_note": HOSTILE,
+            "training": [picture],
+            "config": {"differs": [(HOSTILE, HOSTILE, HOSTILE)], "everything": HOSTILE},
+            "commands": [HOSTILE],
+            "versions": HOSTILE,
+        }
+    )
+    assert text.count("&lt;script&gt;alert(2)") == 29, "every value is there, as text"
+    assert "<script" not in text
+    assert "<img src=x" not in text
+    assert "49" not in re.sub(r"#\w+", "", text), "nor a template"
+    assert "\"'>" not in text, "nor ends an attribute"
+
+
+def test_a_hostile_run_folder_injects_nothing(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Text in every field that is read, of every file, and in the folder's own name."""
+    folder = tmp_path / "<img src=x onerror=alert(1)>"
+    folder.mkdir()
+    results = {
+        HOSTILE: evaluation_result(HOSTILE, 0.1) | {"note": HOSTILE},
+        "paper": evaluation_result("paper", 0.1) | {"falls": HOSTILE},
+    }
+    (folder / "evaluation.json").write_text(json.dumps(results))
+    (folder / "seeds.json").write_text(json.dumps({"seeds": [{"evaluation": results}] * 2}))
+    lines = [metrics_line(0, 1), metrics_line(1, 1) | {"train/loss": HOSTILE}]
+    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    (folder / "config.json").write_text(json.dumps(to_dict(preset("default")) | {HOSTILE: 1}))
+    (folder / "report.json").write_text(json.dumps({"key": HOSTILE, "results": results}))
+    policy = load_policy(run / "policy.safetensors")
+    manifest = policy.manifest | {"versions": {HOSTILE: HOSTILE, "\ud800": "\ud800"}}
+    (folder / "policy.safetensors").write_text("not used")
+    monkeypatch.setattr(reading, "load_policy", lambda path: hostile)
+    hostile = copy.copy(policy)
+    hostile.manifest = manifest
+    monkeypatch.setattr(measuring, "measured", lambda *given: made_up(policy))
+    monkeypatch.setattr(page, "policy_pictures", lambda *given: [])
+    monkeypatch.setattr(page, "video", lambda *given: "")
+    assert main(("report", str(folder))) == 0
+    text = (folder / "report.html").read_text()
+    assert "<script" not in text
+    assert "<img src=x" not in text
+    assert "&lt;img src=x onerror=alert(1)&gt;" in text
+    said = capsys.readouterr().err
+    for name in ("config.json", "evaluation.json", "seeds.json"):
+        assert f"{folder / name} cannot be used" in said
+    assert "metrics.jsonl is shown up to line 2" in said
+
+
+def test_a_policy_that_does_not_say_its_versions_is_shown(run: Path) -> None:
+    policy = copy.copy(load_policy(run / "policy.safetensors"))
+    policy.manifest = {"versions": {"mujoco": "3.17.0", "jax": None, "numpy": "2"}}
+    assert page.versions(policy) == "mujoco 3.17.0, numpy 2"
+    for versions in ({}, {"versions": None}, {"versions": ["mujoco"]}):
+        policy.manifest = versions
+        assert page.versions(policy) == ""
 
 
 def test_a_foreign_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -251,11 +452,11 @@ def browse(browser: str, page: str, folder: Path) -> tuple[str, set[str], Path]:
 
 
 @pytest.mark.browser
-def test_a_browser_shows_it_without_errors_or_requests(page: Path, tmp_path: Path) -> None:
+def test_a_browser_shows_it_without_errors_or_requests(written: Path, tmp_path: Path) -> None:
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         pytest.skip("no Chromium on this machine; Debian's package is chromium")
-    said, asked, shot = browse(browser, page.as_uri(), tmp_path)
+    said, asked, shot = browse(browser, written.as_uri(), tmp_path)
     assert "CONSOLE" not in said, said
     assert not asked
     picture = np.asarray(imageio.imread(shot))

@@ -5,9 +5,13 @@ import types
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.task.reward import body_tilt, failed, reward_terms
+from mjx_balance.task.attitude import body_tilt, roll_pitch
+from mjx_balance.task.reward import failed, reward_terms
 
 TASK = TaskConfig()
 
@@ -50,6 +54,57 @@ def test_tilt_is_the_angle_between_the_z_axes() -> None:
     assert body_tilt(quat) == pytest.approx(4.9985, abs=1e-4)
 
 
+QUATERNIONS = (
+    st.tuples(*[st.floats(-1, 1)] * 4)
+    .map(np.asarray)
+    .filter(lambda q: np.linalg.norm(q) > 0.1)
+    .map(lambda q: q / np.linalg.norm(q))
+)
+
+
+@settings(deadline=None, max_examples=200)
+@given(quat=QUATERNIONS)
+def test_tilt_of_any_orientation(quat: np.ndarray) -> None:
+    """The angle of the turned z axis, by another library; a quaternion and its negative alike."""
+    z = Rotation.from_quat(quat, scalar_first=True).apply((0, 0, 1))
+    angle = np.degrees(np.arctan2(np.hypot(z[0], z[1]), z[2]))
+    assert body_tilt(quat) == pytest.approx(angle, abs=1e-5)
+    assert body_tilt(-quat) == pytest.approx(angle, abs=1e-5)
+
+
+def test_tilt_near_the_upright_is_good_to_a_ten_thousandth_in_float32(
+    xp: types.ModuleType,
+) -> None:
+    """Body leaning by 0 to 0.1 deg, whatever its heading; an arccosine is off by 0.02 deg."""
+    rng = np.random.default_rng(0)
+    lean = np.linspace(0, 0.1, 50)
+    turn = Rotation.from_euler("ZX", np.stack((rng.uniform(-180, 180, 50), lean), -1), degrees=True)
+    quat = turn.as_quat(scalar_first=True).astype(np.float32)
+    np.testing.assert_allclose(body_tilt(xp.asarray(quat)), lean, atol=1e-4)
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    yaw=st.floats(-180, 180),
+    pitch=st.floats(-89, 89),
+    roll=st.floats(-179.9, 179.9),
+)
+def test_roll_and_pitch_of_any_orientation(yaw: float, pitch: float, roll: float) -> None:
+    """Yaw, then pitch about the turned y axis, then roll about the twice turned x axis."""
+    turn = Rotation.from_euler("ZYX", (yaw, pitch, roll), degrees=True)
+    got = roll_pitch(turn.as_quat(scalar_first=True))
+    np.testing.assert_allclose(got, (roll, pitch), atol=1e-5)
+
+
+def test_roll_and_pitch_of_a_batch_and_of_a_nose_dive() -> None:
+    """Leaning right is positive roll, nose down positive pitch; 90 deg of it is still a number."""
+    quat = np.stack([rotation((1, 0, 0), 3.0), rotation((0, 1, 0), 4.0), rotation((0, 1, 0), 90)])
+    quat[2] *= 1 + 1e-9
+    roll, pitch = roll_pitch(quat[None])
+    np.testing.assert_allclose(roll[0, :2], (3, 0), atol=1e-9)
+    np.testing.assert_allclose(pitch[0], (0, 4, 90), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("tilt", "fell"),
     [(0.0, False), (6.0, False), (6.0001, True), (90.0, True), (np.nan, True), (np.inf, True)],
@@ -84,6 +139,23 @@ def test_toward_reward_by_hand(
     """Fig. 5: 0.4 per degree toward the horizontal, no more than 0.4 either way."""
     terms = reward_terms(TASK, xp.asarray(before), xp.asarray(after), xp.asarray(0.0))
     assert float(terms["toward"]) == pytest.approx(reward)
+
+
+def test_every_constant_is_the_configs() -> None:
+    """2 deg after 3.5: 0.7 e^(-0.3 * 2) = 0.384168; 0.6 * 1.5 / 2 = 0.45; a fall 0.9."""
+    task = TaskConfig(
+        reward_level=0.7,
+        reward_sharpness=0.3,
+        reward_toward=0.6,
+        reward_toward_scale=2.0,
+        reward_fail=-0.9,
+        fail_tilt=3.0,
+    )
+    terms = reward_terms(task, np.asarray(3.5), np.asarray(2.0), np.asarray(1.0))
+    assert list(terms) == ["level", "toward", "fail"]
+    got = [float(value) for value in terms.values()]
+    np.testing.assert_allclose(got, (0.384168, 0.45, -0.9), atol=1e-6)
+    assert failed(task, np.asarray([2.9, 3.0, 3.1])).tolist() == [False, False, True]
 
 
 def test_toward_reward_has_its_own_weight_and_scale() -> None:

@@ -2,14 +2,18 @@
 
 import copy
 import dataclasses
+import types
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config, ConfigError
-from mjx_balance.plant import standing_heights
+from mjx_balance.model_fields import model_fields
+from mjx_balance.robots import ROBOTS, Robot
 from mjx_balance.scene import (
     BOARD,
     ROBOT,
@@ -20,7 +24,7 @@ from mjx_balance.scene import (
     scene_dir,
     scene_hash,
 )
-from mjx_balance.task.legs import joint_angles
+from mjx_balance.task.randomization import Conditions
 
 LEGS = ("LF", "RF", "LH", "RH")
 GEOM = mujoco.mjtGeom
@@ -34,19 +38,84 @@ PRIMITIVES = (
 )
 
 
-def standing(config: Config, scene: Scene) -> mujoco.MjData:
+LEAN = float(np.arccos(0.164 / 0.213))
+STANDING = np.tile((0.0, LEAN, -2 * LEAN), (4, 1))
+"""Abduction, hip and knee of 0.35 m: 0.328 m between two links of 0.213 m."""
+
+
+def with_task(config: Config, **values: Any) -> Config:
+    return dataclasses.replace(config, task=dataclasses.replace(config.task, **values))
+
+
+def standing(scene: Scene) -> mujoco.MjData:
     """The robot at rest on the level board, its legs held."""
     data = mujoco.MjData(scene.model)
     data.qpos[:], data.qvel[:] = scene.stance.qpos, scene.stance.qvel
     data.qacc_warmstart[:] = scene.stance.qacc_warmstart
-    angles = joint_angles(config.robot, standing_heights(config))
-    data.ctrl[scene.leg_ctrl] = angles + scene.stance.leg_trim
+    data.ctrl[scene.leg_ctrl] = STANDING + scene.stance.leg_trim
     return data
 
 
-def test_model_has_the_configs_numbers(config: Config, scene: Scene) -> None:
-    for name, modelled in robot_numbers(config.robot, scene.model).items():
-        assert modelled == pytest.approx(getattr(config.robot, name)), name
+def test_model_has_the_robots_numbers(robot: Robot, scene: Scene) -> None:
+    numbers = robot_numbers(robot, scene.model)
+    for name, modelled in numbers.items():
+        assert modelled == pytest.approx(getattr(robot, name)), name
+    fields = {field.name for field in dataclasses.fields(robot) if field.type is float}
+    assert fields - set(numbers) == {"foot_friction"}, "every number is compared"
+
+
+def test_addresses_are_those_of_the_names(scene: Scene) -> None:
+    """Every joint, servo and sensor, looked up the C way."""
+    model, kinds = scene.model, mujoco.mjtObj
+
+    def find(kind: mujoco.mjtObj, name: str) -> int:
+        found = mujoco.mj_name2id(model, kind, name)
+        assert found >= 0, name
+        return found
+
+    for k, leg in enumerate(LEGS):
+        for j, joint in enumerate(("abduction", "hip", "knee")):
+            name = f"robot/{leg}_{joint}"
+            at = model.jnt_qposadr[find(kinds.mjOBJ_JOINT, name)]
+            assert scene.leg_qpos[k, j] == at
+            assert scene.leg_ctrl[k, j] == find(kinds.mjOBJ_ACTUATOR, name)
+    for k, name in enumerate(("board/board_x", "board/board_y")):
+        joint, servo = find(kinds.mjOBJ_JOINT, name), find(kinds.mjOBJ_ACTUATOR, name)
+        assert scene.board_qpos[k] == model.jnt_qposadr[joint]
+        assert scene.board_ctrl[k] == servo
+        assert model.actuator_trnid[servo, 0] == joint
+        np.testing.assert_array_equal(model.jnt_axis[joint], np.eye(3)[k])
+    root = model.jnt_qposadr[find(kinds.mjOBJ_JOINT, "robot/root")]
+    np.testing.assert_array_equal(scene.trunk_quat, root + np.arange(3, 7))
+    gyro, accel = (
+        model.sensor_adr[find(kinds.mjOBJ_SENSOR, f"robot/{name}")]
+        for name in ("gyro", "accelerometer")
+    )
+    assert scene.imu.tolist() == [gyro, gyro + 1, gyro + 2, accel, accel + 1, accel + 2]
+    site = find(kinds.mjOBJ_SITE, "robot/imu")
+    assert (model.sensor_objid == site).all()
+
+
+def test_imu_tells_turning_and_leaning_by_sign(scene: Scene) -> None:
+    """Rolling right reads +x; held nose down by 10 deg gravity reads +-9.81 sin 10 on x."""
+    data = mujoco.MjData(scene.model)
+    root = scene.trunk_quat[0] - 3
+    data.qpos[root : root + 3] = (0, 0, 1)
+    nose_down = Rotation.from_euler("y", 10, degrees=True)
+    data.qpos[scene.trunk_quat] = nose_down.as_quat(scalar_first=True)
+    free = scene.model.jnt_dofadr[scene.model.joint("robot/root").id]
+    data.qvel[free + 3 : free + 6] = (0.1, 0.2, 0.3)
+    mujoco.mj_forward(scene.model, data)
+    # In free fall an accelerometer reads nothing; gravity is what the ground adds.
+    data.qacc[:] = 0
+    mujoco.mj_rnePostConstraint(scene.model, data)
+    mujoco.mj_sensorVel(scene.model, data)
+    mujoco.mj_sensorAcc(scene.model, data)
+    gyro, accel = data.sensordata[scene.imu[:3]], data.sensordata[scene.imu[3:]]
+    np.testing.assert_allclose(gyro, (0.1, 0.2, 0.3), atol=1e-9)
+    up = nose_down.inv().apply((0, 0, 9.81))
+    np.testing.assert_allclose(accel, up, atol=1e-6)
+    assert accel[0] == pytest.approx(-9.81 * np.sin(np.radians(10)), abs=1e-6)
 
 
 def test_model_by_independent_measure(scene: Scene) -> None:
@@ -101,33 +170,97 @@ def test_only_feet_and_board_collide(config: Config, visual: bool) -> None:
     assert len(pairs) == 4
     for leg in LEGS:
         assert {f"{ROBOT}{leg}_foot", f"{BOARD}board"} in pairs
-    np.testing.assert_allclose(model.pair_friction[:, :2], config.robot.foot_friction)
+    np.testing.assert_allclose(model.pair_friction[:, :2], 0.8)
 
 
-def test_robot_stands_at_its_height_at_rest(config: Config, scene: Scene) -> None:
-    stance = scene.stance
-    root = scene.model.joint(f"{ROBOT}root").qposadr[0]
-    assert stance.qpos[root + 2] == pytest.approx(0.35, abs=1.5e-3)
+def test_robot_stands_level_at_its_height_at_rest(scene: Scene) -> None:
+    """By the places of things: feet on the board, hips level, legs where they were told to be."""
+    stance, data = scene.stance, mujoco.MjData(scene.model)
+    data.qpos[:] = stance.qpos
+    mujoco.mj_kinematics(scene.model, data)
+    trunk = data.body("robot/trunk")
+    assert trunk.xpos[2] == pytest.approx(0.35, abs=1.5e-3)
+    np.testing.assert_allclose(trunk.xpos[:2], 0, atol=2e-3)
+    assert trunk.xmat[8] == pytest.approx(1, abs=1e-6)
+    assert trunk.xmat[0] == pytest.approx(1, abs=1e-6)
+    for leg in LEGS:
+        assert data.site(f"robot/{leg}_foot").xpos[2] == pytest.approx(0.022, abs=1.5e-3)
+    np.testing.assert_allclose(stance.qpos[scene.board_qpos], 0, atol=1e-3)
     assert np.abs(stance.qvel).max() < 1e-3
-    assert abs(stance.qpos[scene.trunk_quat[0]]) == pytest.approx(1, abs=1e-6)
     np.testing.assert_allclose(stance.imu, (0, 0, 0, 0, 0, 9.81), atol=5e-3)
-    wanted = joint_angles(config.robot, standing_heights(config))
-    np.testing.assert_allclose(stance.qpos[scene.leg_qpos], wanted, atol=1e-3)
+    np.testing.assert_allclose(stance.qpos[scene.leg_qpos], STANDING, atol=2e-4)
 
 
-def test_robot_keeps_standing_on_the_level_board(config: Config, scene: Scene) -> None:
+def test_trim_is_what_the_load_bends_the_servos_by(scene: Scene) -> None:
+    """A servo of 400 N m/rad that carries a torque stands torque / 400 off its target."""
+    data = standing(scene)
+    mujoco.mj_forward(scene.model, data)
+    torque = data.actuator_force[scene.leg_ctrl]
+    assert np.abs(torque[:, 2]).min() > 1, "knees carry the robot"
+    np.testing.assert_allclose(torque / 400, scene.stance.leg_trim, atol=2e-4)
+    upward = sum(np.ravel(data.contact[k].frame)[2] for k in range(data.ncon))
+    assert data.ncon == 4
+    assert abs(upward) == pytest.approx(4, abs=1e-3)
+
+
+def test_stance_goes_on_as_if_nothing_had_begun(scene: Scene) -> None:
+    """The first step from it reads what the last step of the settling read."""
+    data = standing(scene)
+    mujoco.mj_step(scene.model, data)
+    np.testing.assert_allclose(data.sensordata[scene.imu], scene.stance.imu, atol=1e-4)
+    np.testing.assert_allclose(data.qacc_warmstart, scene.stance.qacc_warmstart, atol=1e-3)
+    np.testing.assert_allclose(data.qpos, scene.stance.qpos, atol=1e-6)
+
+
+@pytest.mark.parametrize("height", [0.25, 0.38])
+def test_robot_stands_at_the_height_it_is_told(config: Config, height: float) -> None:
+    scene = load_scene(with_task(config, body_height=height))
+    root = scene.model.joint(f"{ROBOT}root").qposadr[0]
+    assert scene.stance.qpos[root + 2] == pytest.approx(height, abs=2e-3)
+    assert scene.model.body(f"{ROBOT}trunk").pos[2] == pytest.approx(height)
+
+
+def with_robot(
+    config: Config, robot: Robot, monkeypatch: pytest.MonkeyPatch, **changes: float
+) -> Config:
+    """The config with another robot, known for the length of a test."""
+    monkeypatch.setitem(ROBOTS, "other", dataclasses.replace(robot, name="other", **changes))
+    return dataclasses.replace(config, robot="other")
+
+
+def test_model_takes_its_numbers_from_config_and_robot(
+    config: Config, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Time step and friction; rolling friction and contact stiffness stay as they are."""
+    other = with_robot(config, robot, monkeypatch, foot_friction=0.55)
+    model = build_model(with_task(other, sim_dt=0.002))
+    assert model.opt.timestep == 0.002
+    np.testing.assert_allclose(model.pair_friction, [(0.55, 0.55, 0.005, 0.0001, 0.0001)] * 4)
+    np.testing.assert_allclose(model.pair_solref, [(0.01, 1)] * 4)
+    assert model.pair_dim.tolist() == [3] * 4
+    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+
+
+def test_robot_that_does_not_come_to_rest_is_refused(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps of 20 ms are too long for contacts of 10 ms: the simulation diverges."""
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
+    with pytest.raises(ConfigError, match=r"does not stand still at body_height 0\.35 m with"):
+        load_scene(with_task(config, sim_dt=0.02))
+
+
+def test_robot_keeps_standing_on_the_level_board(scene: Scene) -> None:
     """10 s: it neither sinks nor creeps."""
-    data = standing(config, scene)
+    data = standing(scene)
     mujoco.mj_step(scene.model, data, nstep=2500)
     np.testing.assert_allclose(data.qpos, scene.stance.qpos, atol=1e-3)
 
 
 @pytest.mark.parametrize("goal", [(7.0, 7.0), (-7.0, 7.0)])
-def test_board_follows_its_command_under_the_robot(
-    config: Config, scene: Scene, goal: tuple[float, float]
-) -> None:
+def test_board_follows_its_command_under_the_robot(scene: Scene, goal: tuple[float, float]) -> None:
     """A ramp of 3.5 deg/s on both axes at once, then 2 s of rest: 0.1 deg at every step."""
-    data = standing(config, scene)
+    data = standing(scene)
     for k in range(1000):
         command = np.clip(3.5 * 0.004 * (k + 1), 0, 7) * np.sign(goal)
         data.ctrl[scene.board_ctrl] = np.radians(command)
@@ -143,39 +276,179 @@ def test_looks_do_not_change_the_physics(config: Config, scene: Scene) -> None:
     np.testing.assert_allclose(seen.stance.qpos, scene.stance.qpos, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "array",
-    [
-        "body_mass",
-        "body_inertia",
-        "actuator_gainprm",
-        "actuator_forcerange",
-        "dof_damping",
-        "pair_friction",
-        "jnt_range",
-        "geom_size",
-    ],
-)
-def test_hash_sees_a_change_of_one_percent(scene: Scene, array: str) -> None:
+PHYSICS = (
+    "body_mass body_inertia body_ipos body_iquat body_pos body_quat jnt_type jnt_axis jnt_pos "
+    "jnt_range jnt_limited jnt_solref jnt_stiffness qpos0 dof_armature dof_damping "
+    "dof_frictionloss actuator_gainprm actuator_biasprm actuator_forcerange actuator_ctrlrange "
+    "actuator_gear site_pos site_quat pair_friction pair_solref pair_solimp pair_margin pair_gap "
+    "pair_dim pair_solreffriction sensor_type sensor_objid geom_size geom_pos geom_quat"
+).split()
+UNHASHED = (
+    "qpos_spring jnt_solimp dof_solref dof_solimp dof_parentid body_gravcomp body_parentid "
+    "actuator_trnid actuator_trntype actuator_forcelimited actuator_ctrllimited "
+    "actuator_gaintype actuator_biastype actuator_dyntype jnt_actfrclimited geom_type sensor_noise"
+).split()
+OPTIONS = "timestep gravity integrator cone impratio disableflags".split()
+SOLVER = (
+    "solver iterations ls_iterations tolerance ls_tolerance noslip_iterations enableflags density "
+    "viscosity wind"
+).split()
+
+
+@pytest.mark.parametrize("array", [*PHYSICS, *UNHASHED])
+def test_hash_sees_a_change_of_any_number(scene: Scene, array: str) -> None:
+    """Of the last entry alone, by a percent or by one."""
     model = copy.copy(scene.model)
-    getattr(model, array)[...] *= 1.01
+    values = getattr(model, array).reshape(-1)
+    assert values.size > 0
+    where = np.flatnonzero(values)[-1] if values.any() else values.size - 1
+    whole = values.dtype.kind in "iub"
+    flat = getattr(model, array).reshape(-1)
+    flat[where] = 1 - flat[where] if whole else 1.01 * flat[where] + 1e-3 * (flat[where] == 0)
+    assert (getattr(model, array) != getattr(scene.model, array)).any()
     assert scene_hash(model) != scene.hash
 
 
-@pytest.mark.parametrize("option", ["impratio", "disableflags", "cone"])
-def test_hash_sees_a_change_of_the_solvers_model(scene: Scene, option: str) -> None:
-    """E.g. impratio sets how far feet creep on a slope (scenes/scene.xml)."""
+@pytest.mark.parametrize("option", [*OPTIONS, *SOLVER])
+def test_hash_sees_a_change_of_the_engines_options(scene: Scene, option: str) -> None:
+    """E.g. impratio sets how far feet creep on a slope; one Newton iteration falls."""
     model = copy.copy(scene.model)
-    setattr(model.opt, option, getattr(model.opt, option) + 1)
+    value = getattr(model.opt, option)
+    if isinstance(value, np.ndarray):
+        value[-1] += 0.1
+    else:
+        setattr(model.opt, option, value - 1 if option in ("cone", "solver") else value + 1)
     assert scene_hash(model) != scene.hash
 
 
-@pytest.mark.parametrize("name", ["thigh", "foot_radius", "total_mass", "knee_torque"])
-def test_config_that_disagrees_with_the_robot_is_refused(config: Config, name: str) -> None:
-    value = 1.05 * getattr(config.robot, name)
-    robot = dataclasses.replace(config.robot, **{name: value})
+def test_hash_sees_which_geoms_touch(scene: Scene) -> None:
+    model = copy.copy(scene.model)
+    foot = model.pair_geom2 if len(set(model.pair_geom2)) == 4 else model.pair_geom1
+    foot[0] = foot[1]
+    assert scene_hash(model) != scene.hash
+
+
+def test_hash_is_blind_to_looks_and_to_rounding(scene: Scene) -> None:
+    """Colours, cameras, lights; masses off by 1e-9, as another compiler may make them."""
+    model = copy.copy(scene.model)
+    for looks in ("geom_rgba", "cam_pos", "light_diffuse", "mat_rgba", "site_rgba", "site_size"):
+        getattr(model, looks)[...] *= 0.5
+    model.body_mass[...] *= 1 + 1e-9
+    assert scene_hash(model) == scene.hash
+    assert len(scene.hash) == 16
+    assert int(scene.hash, 16) >= 0
+
+
+def test_same_scene_same_hash_other_scene_other_hash(config: Config, scene: Scene) -> None:
+    assert scene_hash(build_model(config)) == scene.hash
+    lower = with_task(config, body_height=0.34)
+    assert scene_hash(build_model(lower)) != scene.hash
+
+
+COMPARED = (
+    "hip_x hip_y abduction_offset thigh calf foot_radius trunk_mass total_mass knee_min knee_max "
+    "hip_torque knee_torque servo_stiffness servo_damping"
+).split()
+
+
+@pytest.mark.parametrize("name", COMPARED)
+def test_a_record_that_disagrees_with_its_model_is_refused(
+    config: Config, robot: Robot, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    value = 1.05 * getattr(robot, name)
     with pytest.raises(ConfigError, match=rf"{name} is {value}, but the robot .* has"):
-        build_model(dataclasses.replace(config, robot=robot))
+        build_model(with_robot(config, robot, monkeypatch, **{name: value}))
+
+
+def circumstances(xp: types.ModuleType = np) -> Conditions:
+    """Three worlds: nominal; loaded off the centre; loaded on the axis, weak and slippery."""
+    return Conditions(
+        imu_noise=xp.zeros((3, 6)),
+        payload=xp.asarray((0.0, 4.0, 2.5)),
+        payload_at=xp.asarray(((0.01, 0.02, 0.03), (0.05, -0.04, 0.08), (0.0, 0.0, 0.1))),
+        friction=xp.asarray((0.8, 0.4, 0.6)),
+        gain=xp.asarray((1.0, 1.1, 0.8)),
+        latency=xp.zeros(3),
+    )
+
+
+def point_mass(mass: float, arm: np.ndarray) -> np.ndarray:
+    """(3, 3) inertia tensor of a point mass at `arm` from the reference."""
+    return mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+
+
+def test_payload_by_the_parallel_axis_theorem(scene: Scene) -> None:
+    """Full tensors about the common centre; the products are left out, as documented."""
+    trunk, conditions = scene.model.body("robot/trunk").id, circumstances()
+    fields = model_fields(scene, conditions)
+    mass, inertia = 6.92, np.diag((0.0278, 0.0902, 0.1041))
+    for k in range(3):
+        load, at = conditions.payload[k], conditions.payload_at[k]
+        centre = load * at / (mass + load)
+        whole = inertia + point_mass(mass, -centre) + point_mass(load, at - centre)
+        assert fields["body_mass"][k, trunk] == pytest.approx(mass + load)
+        np.testing.assert_allclose(fields["body_ipos"][k, trunk], centre, atol=1e-12)
+        np.testing.assert_allclose(fields["body_inertia"][k, trunk], np.diag(whole), atol=1e-12)
+
+
+def test_payload_weighs_what_a_body_on_the_trunk_weighs(scene: Scene) -> None:
+    """On the axis, where nothing is left out: the mass matrix of a model with one more body."""
+    spec = mujoco.MjSpec.from_file(str(scene_dir() / "quadruped.xml"))
+    plain = spec.compile()
+    load = spec.body("trunk").add_body(name="load", pos=[0, 0, 0.1])
+    load.mass, load.ipos, load.inertia = 2.5, [0, 0, 0], [1e-12] * 3
+    load.explicitinertial = True
+    heavier = spec.compile()
+    fields = model_fields(scene, circumstances())
+    ours, trunk = plain.body("trunk").id, scene.model.body("robot/trunk").id
+    for name in ("body_mass", "body_ipos", "body_inertia"):
+        getattr(plain, name)[ours] = fields[name][2, trunk]
+    mujoco.mj_setConst(plain, mujoco.MjData(plain))
+
+    def mass_matrix(model: mujoco.MjModel) -> np.ndarray:
+        data, dense = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+        data.qpos[3:7] = Rotation.from_euler("xyz", (0.2, -0.3, 0.4)).as_quat(scalar_first=True)
+        data.qpos[7:] = STANDING.ravel()
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, dense)
+        return dense
+
+    assert heavier.nv == plain.nv
+    np.testing.assert_allclose(mass_matrix(plain), mass_matrix(heavier), atol=1e-9)
+
+
+def test_friction_and_gain_reach_every_foot_and_leg_and_nothing_else(scene: Scene) -> None:
+    model, fields = scene.model, model_fields(scene, circumstances())
+    legs, board = scene.leg_ctrl.ravel(), scene.board_ctrl
+    for k, (friction, gain) in enumerate(((0.8, 400.0), (0.4, 440.0), (0.6, 320.0))):
+        rows = [(friction, friction, 0.005, 0.0001, 0.0001)] * 4
+        np.testing.assert_allclose(fields["pair_friction"][k], rows)
+        np.testing.assert_allclose(fields["actuator_gainprm"][k, legs, 0], gain)
+        np.testing.assert_allclose(fields["actuator_biasprm"][k, legs, 1], -gain)
+        for name in ("actuator_gainprm", "actuator_biasprm"):
+            ours, nominal = fields[name][k].copy(), getattr(model, name)
+            np.testing.assert_array_equal(ours[board], nominal[board])
+            np.testing.assert_array_equal(ours[:, 2:], nominal[:, 2:])
+    trunk = model.body("robot/trunk").id
+    for name in ("body_mass", "body_ipos", "body_inertia"):
+        ours, nominal = fields[name], getattr(model, name)
+        others = np.arange(model.nbody) != trunk
+        np.testing.assert_array_equal(ours[:, others], np.stack([nominal[others]] * 3))
+
+
+def test_nominal_circumstances_are_the_model(xp: types.ModuleType, scene: Scene) -> None:
+    for name, values in model_fields(scene, circumstances(xp)).items():
+        assert values.shape == (3, *getattr(scene.model, name).shape)
+        np.testing.assert_allclose(values[0], getattr(scene.model, name), rtol=1e-6, atol=1e-9)
+
+
+def test_one_world_in_jax_equals_its_row_in_numpy(scene: Scene) -> None:
+    import jax.numpy as jnp
+
+    alone = Conditions(*(jnp.asarray(x[1]) for x in circumstances()))
+    whole = model_fields(scene, circumstances())
+    for name, values in model_fields(scene, alone).items():
+        np.testing.assert_allclose(values, whole[name][1], rtol=1e-5, atol=1e-8, err_msg=name)
 
 
 @pytest.mark.parametrize("path", sorted(scene_dir().glob("*.xml")), ids=lambda path: path.stem)

@@ -46,7 +46,7 @@ def test_policy_balances(path: Path, suite: str, mean: float, most: float) -> No
 
 def test_scenarios_of_the_check_do_tilt(config: Config, scene: Scene) -> None:
     """The limits above mean something: these boards take a standing robot down."""
-    from mjx_balance.baselines import make_controller
+    from mjx_balance.controllers import make_controller
     from mjx_balance.evaluation import roll_out
 
     drawn, _ = make_scenarios(config, "corner", 8, 20.0, 11)

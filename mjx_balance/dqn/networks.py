@@ -1,37 +1,13 @@
 """Q-networks."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-
-def fold_inputs(params: Any, mean: jax.Array, matrix: jax.Array) -> Any:
-    """Parameters that give for obs what `params` give for (obs - mean) @ matrix.
-
-    Args:
-      params: variables of a `QNetwork` with at least one hidden layer.
-      mean: (obs_size,)
-      matrix: (obs_size, obs_size)
-    """
-    layers = dict(params["params"])
-
-    def folded(layer: Any, first: int) -> dict[str, jax.Array]:
-        kernel = layer["kernel"]
-        rows = matrix @ kernel[first : first + len(mean)]
-        bias = layer["bias"] - mean @ rows
-        return {"kernel": kernel.at[first : first + len(mean)].set(rows), "bias": bias}
-
-    layers["hidden_0"] = folded(layers["hidden_0"], 0)
-    hidden = max(int(name[7:]) for name in layers if name.startswith("hidden_"))
-    width = len(layers[f"hidden_{hidden}"]["bias"])
-    if len(layers["head"]["kernel"]) > width:  # it also sees the observation itself
-        layers["head"] = folded(layers["head"], width)
-    return {"params": layers}
+from mjx_balance.dqn import heads
 
 
 class QNetwork(nn.Module):
@@ -44,16 +20,12 @@ class QNetwork(nn.Module):
     https://arxiv.org/abs/2010.14680, section 3, hyperedges of rank one).
 
     With `radial`, the levels are points x from -1 to 1 on one axis per factor, and the
-    network says where the best point mu is and what it is worth:
-
-        Q(s, a) = V(s) + alpha * exp(-beta * z) - kappa * z
-        z = sqrt(delta^2 + |k * (x(a) - mu(s))|^2)
-
-    alpha, beta, kappa, delta > 0 and k (factors,) are parameters that no state changes.
+    network says where the best point mu is and what it is worth (`heads.radial`).
     It is the idea of normalized advantage functions (Gu et al. 2016,
     https://arxiv.org/abs/1603.00748, section 4), a value that falls off around a best
     action, with a learned profile instead of a parabola, on a grid of actions. mu and V
-    also see the observation past the hidden layers, so that a linear law is easy.
+    also see the observation past the hidden layers, so that a linear law is easy; the
+    profile and the axes' scales are parameters that no state changes.
     """
 
     hidden_sizes: Sequence[int]
@@ -66,27 +38,32 @@ class QNetwork(nn.Module):
         x = obs
         for i, width in enumerate(self.hidden_sizes):
             x = nn.relu(nn.Dense(width, name=f"hidden_{i}")(x))
-        if self.radial:
-            return self._radial(jnp.concatenate((x, obs), axis=-1))
-        branches = nn.Dense(sum(self.factors), name="head")(x)
-        values = branches[..., : self.factors[0]]
-        start = self.factors[0]
-        for levels in self.factors[1:]:
-            branch = branches[..., start : start + levels]
-            start += levels
-            values = values[..., :, None] + branch[..., None, :]
-            values = values.reshape(*values.shape[:-2], math.prod(values.shape[-2:]))
-        return values
-
-    def _radial(self, features: jax.Array) -> jax.Array:
+        if not self.radial:
+            return heads.added_up(nn.Dense(sum(self.factors), name="head")(x), self.factors)
+        features = jnp.concatenate((x, obs), axis=-1)
         out = nn.Dense(1 + len(self.factors), name="head")(features)
-        value, best = out[..., :1], out[..., 1:]
-        shape = self.param("profile", nn.initializers.zeros, (4,))
+        profile = self.param("profile", nn.initializers.zeros, (4,))
         stretch = self.param("stretch", nn.initializers.zeros, (len(self.factors),))
-        alpha, beta, kappa, delta = nn.softplus(shape)
-        axes = [np.linspace(-1, 1, levels) for levels in self.factors]
-        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        points = points.reshape(-1, len(self.factors)).astype(np.float32)
-        away = (points - best[..., None, :]) * jnp.exp(stretch)
-        z = jnp.sqrt(delta**2 + jnp.sum(away**2, axis=-1))
-        return value + alpha * jnp.exp(-beta * z) - kappa * z
+        return heads.radial(out, profile, stretch, heads.points(self.factors))
+
+    def folded(self, params: Any, mean: jax.Array, matrix: jax.Array) -> Any:
+        """Parameters that give for obs what `params` give for (obs - mean) @ matrix.
+
+        Args:
+          params: this network's variables.
+          mean: (obs_size,)
+          matrix: (obs_size, obs_size)
+        """
+        layers = dict(params["params"])
+        entrances = [("hidden_0" if self.hidden_sizes else "head", 0)]
+        if self.radial:  # the head also sees the observation itself, behind the last layer
+            entrances.append(("head", self.hidden_sizes[-1] if self.hidden_sizes else len(mean)))
+        for name, first in entrances:
+            kernel, bias = layers[name]["kernel"], layers[name]["bias"]
+            rows = matrix @ kernel[first : first + len(mean)]
+            bias = bias - mean @ rows
+            layers[name] = {
+                "kernel": kernel.at[first : first + len(mean)].set(rows),
+                "bias": bias,
+            }
+        return {"params": layers}

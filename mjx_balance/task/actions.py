@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from mjx_balance.config import RobotConfig, TaskConfig
+from mjx_balance.config import TaskConfig
+from mjx_balance.robots import Robot
 from mjx_balance.task import Array
 
 
@@ -33,18 +34,16 @@ def nearest_action(task: TaskConfig, change: np.ndarray) -> np.ndarray:
     return (level[..., 0] * task.action_levels + level[..., 1]).astype(int)
 
 
-def leg_signs(robot: RobotConfig) -> np.ndarray:
+def leg_signs(robot: Robot) -> np.ndarray:
     """Which way each foot goes: left +a_x, right -a_x, front +a_y, hind -a_y.
 
     Returns:
       (2, legs) of +-1, float32.
     """
-    left = [1.0 if name[0] == "L" else -1.0 for name in robot.legs]
-    front = [1.0 if name[1] == "F" else -1.0 for name in robot.legs]
-    return np.asarray((left, front), np.float32)
+    return np.where((robot.left, robot.front), np.float32(1), np.float32(-1))
 
 
-def apply_action(task: TaskConfig, robot: RobotConfig, heights: Array, change: Array) -> Array:
+def apply_action(task: TaskConfig, robot: Robot, heights: Array, change: Array) -> Array:
     """Adds one action to the foot heights.
 
     Raising the left side by a_x means longer left legs and shorter right ones.
@@ -52,7 +51,7 @@ def apply_action(task: TaskConfig, robot: RobotConfig, heights: Array, change: A
 
     Args:
       task: names the units.
-      robot: leg names and reach.
+      robot: sides and reach of the legs.
       heights: (..., legs) commanded foot heights, m.
       change: (..., 2) a_x and a_y, m.
 

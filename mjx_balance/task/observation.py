@@ -5,14 +5,15 @@ On request the commanded foot heights follow the measured ones.
 
 import numpy as np
 
-from mjx_balance.config import RobotConfig, TaskConfig
+from mjx_balance.config import TaskConfig
+from mjx_balance.robots import Robot
 from mjx_balance.task import Array
 
 IMU_CHANNELS = 6
 """Gyro x, y, z in rad/s, then accelerometer x, y, z in m/s^2."""
 
 
-def observation_names(task: TaskConfig, robot: RobotConfig) -> tuple[str, ...]:
+def observation_names(task: TaskConfig, robot: Robot) -> tuple[str, ...]:
     """Name of every observation entry, in order, e.g. `H_LF`, `V_x,t-2`, `Acc_y,t-15`.
 
     Commanded heights are `C_LF,d-1`: LF's of the decision before the latest. With
@@ -25,7 +26,7 @@ def observation_names(task: TaskConfig, robot: RobotConfig) -> tuple[str, ...]:
     return tuple(names)
 
 
-def observation_scale(task: TaskConfig, robot: RobotConfig) -> np.ndarray:
+def observation_scale(task: TaskConfig, robot: Robot) -> np.ndarray:
     """(obs_size,) physical size of a network input of 1: m, rad/s and m/s^2."""
     return np.asarray(
         [task.height_scale] * (1 + len(task.command_lags)) * len(robot.legs)
@@ -35,9 +36,7 @@ def observation_scale(task: TaskConfig, robot: RobotConfig) -> np.ndarray:
     )
 
 
-def observe(
-    task: TaskConfig, robot: RobotConfig, heights: Array, commanded: Array, imu: Array
-) -> Array:
+def observe(task: TaskConfig, robot: Robot, heights: Array, commanded: Array, imu: Array) -> Array:
     """Builds the scaled observation.
 
     Args:

@@ -12,6 +12,7 @@ from mjx_balance.config import Config, ConfigError, check
 from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.env import BalanceEnv
+from mjx_balance.policy import action_factors
 from mjx_balance.training.program_cache import Say, enable_compilation_cache
 
 STATE_COPIES = 2
@@ -38,25 +39,22 @@ def size_to_device(config: Config) -> Config:
     """
     available = jax.devices()
     on_cpu = available[0].platform == "cpu"
-    num_envs, dqn = config.num_envs, config.dqn
+    num_envs, batch_size = config.num_envs, config.dqn.batch_size
     if num_envs is None:
         num_envs = CPU_ENVS if on_cpu else ACCELERATOR_ENVS
-        # More envs at once must not mean fewer updates per decision.
-        updates = dqn.updates_per_step * num_envs // CPU_ENVS
-        dqn = dataclasses.replace(dqn, updates_per_step=updates)
     num_devices = config.num_devices
     if num_devices is None:
-        num_devices = _even_share(len(available), num_envs, dqn.batch_size)
+        num_devices = _even_share(len(available), num_envs, batch_size)
     elif num_devices > len(available):
         raise ConfigError(
             f"num_devices is {num_devices}; this machine has {len(available)} JAX devices"
         )
-    for name, value in (("num_envs", num_envs), ("batch_size", dqn.batch_size)):
+    for name, value in (("num_envs", num_envs), ("batch_size", batch_size)):
         if value % num_devices:
             raise ConfigError(
                 f"{name} is {value}; it must be a multiple of num_devices, {num_devices}"
             )
-    sized = dataclasses.replace(config, num_envs=num_envs, num_devices=num_devices, dqn=dqn)
+    sized = dataclasses.replace(config, num_envs=num_envs, num_devices=num_devices)
     return check(sized)
 
 
@@ -65,23 +63,21 @@ def _even_share(available: int, *counts: int) -> int:
     return next(n for n in range(available, 0, -1) if not any(count % n for count in counts))
 
 
-def action_factors(config: Config, env: BalanceEnv) -> tuple[int, ...]:
-    """Output branches of the network: all actions at once, or roll and pitch apart."""
-    return (env.action_size,) if config.dqn.head == "joint" else env.action_factors
-
-
 def make_learner(config: Config, env: BalanceEnv) -> Learner:
     """The DQN for a config that `size_to_device` has completed."""
     assert config.num_envs is not None
     assert config.num_devices is not None
     return Learner(
         env,
-        QNetwork(config.dqn.hidden_sizes, action_factors(config, env), config.dqn.head == "radial"),
+        QNetwork(config.dqn.hidden_sizes, action_factors(config), config.dqn.head == "radial"),
         config.dqn,
         config.num_envs,
         config.num_env_steps,
         jax.devices()[: config.num_devices],
         config.num_seeds,
+        env.symmetries,
+        env.action_factors,
+        env.reset_staggered,
     )
 
 

@@ -1,28 +1,25 @@
 """The end of a run: a policy per seed, their evaluation, the best one, figures, a summary."""
 
 import dataclasses
+import json
 import time
 from typing import Any
 
 import jax
 from tensorboardX import SummaryWriter
 
-from mjx_balance import evaluation, figures, report
+from mjx_balance import evaluation
 from mjx_balance.config import Config, ConfigError
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.policy import Policy, PolicyError, load_policy, make_manifest, save_policy
+from mjx_balance.report import figures, measuring, tables
 from mjx_balance.run_folder import RunFolder, write_atomically, write_json
 from mjx_balance.statistics import over_seeds
+from mjx_balance.suites import HEADLINE, SEEDS
 from mjx_balance.training.loop import number
 from mjx_balance.training.program_cache import Say
 
-EVALUATED = ("paper", "corner")
-"""Suites of the evaluation after training."""
-EVALUATION_SEED = 1_000_000
-"""Seed of the final evaluation's scenarios; training draws from other generators."""
-VALIDATION_SEED = 3_000_000
-"""Seed of the scenarios that choose among several training seeds; never reported."""
 VALIDATION_SCENARIOS = 32
 EVALUATION_EVENTS = ".evaluation"
 """Ending of the TensorBoard file that has it."""
@@ -79,7 +76,7 @@ def export(
         own = dataclasses.replace(config, seed=config.seed + k, num_seeds=1)
         mine = jax.tree.map(lambda x: x[k], known) if config.num_seeds > 1 else known  # noqa: B023
         weights = jax.device_get(learner.exported(mine))
-        manifest = make_manifest(own, scene_hash, tuple(learner.network.factors), training)
+        manifest = make_manifest(own, scene_hash, training)
         file = folder.policy if config.num_seeds == 1 else folder.seed_policy(own.seed)
         try:
             file.parent.mkdir(exist_ok=True)
@@ -106,27 +103,34 @@ def finish(
     several = config.num_seeds > 1
     scenarios, duration = config.eval_scenarios, config.eval_duration
     each = [
-        _evaluate(policy, scenarios, duration, EVALUATION_SEED, several, display)
-        for policy in policies
+        _evaluate(policy, scenarios, duration, SEEDS.final, several, display) for policy in policies
     ]
     best = _choose(policies, each, duration, folder, display) if several else 0
     results = each[best]
     _log(results, policies[best].manifest["training"]["env_steps"], folder)
     with display.phase("drawing figures"):
-        figures.draw_figures(folder.path, load_policy(folder.policy))
+        _draw(folder)
     write_json(folder.evaluation, results)
-    report.print_summary(display.console, folder.path, results, time.perf_counter() - began)
+    tables.print_summary(display.console, folder.path, results, time.perf_counter() - began)
     return results
+
+
+def _draw(folder: RunFolder) -> None:
+    policy = load_policy(folder.policy)
+    lines = [json.loads(text) for text in folder.metrics.read_text().splitlines()]
+    shown = measuring.recorded(policy, "paper", measuring.RECORD_SECONDS, SEEDS.record)
+    scene = evaluation.policy_scene(policy)
+    figures.draw_figures(folder.figures, lines, policy.config.task, scene, {"policy": shown})
 
 
 def _evaluate(
     policy: Policy, scenarios: int, duration: float, seed: int, several: bool, display: Display
 ) -> Results:
     """Evaluates a policy on every suite."""
-    doing = "validating" if seed == VALIDATION_SEED else "evaluating in plain MuJoCo"
+    doing = "validating" if seed == SEEDS.validation else "evaluating in plain MuJoCo"
     whose = f", seed {policy.config.seed}" if several else ""
     results = {}
-    for suite in EVALUATED:
+    for suite in HEADLINE:
         with display.bar(f"{doing}, suite {suite}{whose}") as bar:
             results[suite] = evaluation.evaluate(policy, suite, scenarios, duration, seed, bar)
     return results
@@ -152,20 +156,20 @@ def _choose(
 ) -> int:
     """Validates every seed, makes the best one the run's policy, writes seeds.json."""
     validated = [
-        _evaluate(policy, VALIDATION_SCENARIOS, duration, VALIDATION_SEED, True, display)
+        _evaluate(policy, VALIDATION_SCENARIOS, duration, SEEDS.validation, True, display)
         for policy in policies
     ]
     best = min(range(len(policies)), key=lambda k: _score(validated[k]))
     seeds = [policy.config.seed for policy in policies]
     write_atomically(folder.policy, folder.seed_policy(seeds[best]).read_bytes())
-    summary = {suite: over_seeds([results[suite] for results in each]) for suite in EVALUATED}
+    summary = {suite: over_seeds([results[suite] for results in each]) for suite in HEADLINE}
     rows = [
         {"seed": seed, "validation": validation, "evaluation": results}
         for seed, validation, results in zip(seeds, validated, each, strict=True)
     ]
     write_json(folder.seeds_summary, {"best": seeds[best], "statistics": summary, "seeds": rows})
     display.say(f"best of the {len(policies)} seeds on the validation set: {seeds[best]}")
-    display.console.print(report.seeds_table(summary))
+    display.console.print(tables.seeds_table(summary))
     return best
 
 

@@ -6,7 +6,6 @@ StableHLO (`jax.export`) under a digest of everything it is traced from. Both ca
 an optional help: what is damaged or cannot be written is said and made anew.
 """
 
-import ast
 import contextlib
 import hashlib
 import importlib.metadata
@@ -24,8 +23,8 @@ from jax import export
 from mjx_balance.config import Config, to_dict
 from mjx_balance.run_folder import write_atomically
 from mjx_balance.scene import scene_dir
+from mjx_balance.sources import code
 
-PACKAGE = Path(__file__).resolve().parents[1]
 LIBRARIES = ("mjx_balance", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax")
 """What a run's bits depend on besides this package's code."""
 NOT_TRACED = (
@@ -109,40 +108,10 @@ def program_key(config: Config, iterations: int, root: str) -> str:
     devices = [(device.platform, device.device_kind) for device in jax.devices()]
     flags = [str(getattr(jax.config, name)) for name in FLAGS]
     key = hashlib.sha256(repr((values, iterations, devices, flags, versions())).encode())
-    for path in [*sources(root), *sorted(scene_dir().glob("*.xml"))]:
+    key.update(repr(sorted(code(root).items())).encode())
+    for path in sorted(scene_dir().glob("*.xml")):
         key.update(path.name.encode() + b"\0" + path.read_bytes())
     return key.hexdigest()[:32]
-
-
-def sources(root: str) -> list[Path]:
-    """Files of this package that a module imports, directly or not, its own included."""
-    found: set[Path] = set()
-    waiting = [root]
-    while waiting:
-        name = waiting.pop()
-        path = _source(name)
-        if path is None:  # a name in a module, not a module
-            name = name.rpartition(".")[0]
-            path = _source(name)
-        if path is None or path in found:
-            continue
-        found.add(path)
-        for node in ast.walk(ast.parse(path.read_bytes())):
-            if isinstance(node, ast.Import):
-                waiting += [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                waiting += [f"{node.module}.{alias.name}" for alias in node.names]
-    return sorted(found)
-
-
-def _source(module: str) -> Path | None:
-    """File of a module of this package."""
-    package, *parts = module.split(".")
-    if package != PACKAGE.name:
-        return None
-    path = PACKAGE.joinpath(*parts)
-    files = (path / "__init__.py", path.with_suffix(".py"))
-    return next((file for file in files if file.is_file()), None)
 
 
 def compile_program(

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 
-from mjx_balance import physics
 from mjx_balance.config import Config, check
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
@@ -78,8 +77,6 @@ def provenance(env: BalanceEnv) -> dict[str, Any]:
     return {
         "scene_hash": env.scene.hash,
         "engine": env.backend,
-        "solver_iterations": physics.SOLVER_ITERATIONS,
-        "line_search_iterations": physics.LINE_SEARCH_ITERATIONS,
         "versions": program_cache.versions(),
     }
 

@@ -1,6 +1,6 @@
-"""Figures of runs, policies and baselines. No JAX."""
+"""Figures of what was measured; nothing here simulates."""
 
-import json
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,17 +8,15 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from mjx_balance.config import Config, TaskConfig
-from mjx_balance.evaluation import Controller, Envelope, observing, policy_scene, run_suite
-from mjx_balance.policy import Policy
+from mjx_balance.config import TaskConfig
+from mjx_balance.evaluation import Envelope, Rollout
 from mjx_balance.scene import Scene
-from mjx_balance.task.reward import reward_terms, roll_pitch
+from mjx_balance.task.attitude import roll_pitch
+from mjx_balance.task.reward import reward_terms
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-RECORD_SECONDS = 100.0
-RECORD_SEED = 2_000_000
 BLUE, ORANGE, GREY = "#2166ac", "#d6604d", "#777777"
 SHADES = ("#b2182b", "#ef8a62", "#7f7f7f", "#1a9850", "#91cf60")
 STYLE: dict[Any, Any] = {
@@ -34,31 +32,43 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def draw_figures(run_dir: Path, policy: Policy) -> list[Path]:
-    """Draws a run's figures into its folder.
+def draw_figures(
+    folder: Path,
+    metrics: list[dict[str, Any]],
+    task: TaskConfig,
+    scene: Scene,
+    rollouts: Mapping[str, Rollout],
+) -> list[Path]:
+    """Draws a run's figures.
 
     Args:
-      run_dir: with metrics.jsonl.
-      policy: the run's policy.
+      folder: to write them to; made if it is missing.
+      metrics: the lines of metrics.jsonl.
+      task: gives the reward.
+      scene: of the rollouts.
+      rollouts: see `rollout_figure`.
 
     Returns:
       The files written.
     """
-    figures = run_dir / "figures"
-    figures.mkdir(exist_ok=True)
-    lines = (run_dir / "metrics.jsonl").read_text().splitlines()
+    folder.mkdir(exist_ok=True)
     with plt.rc_context(STYLE):
         drawn = {
-            "learning_curves.png": learning_curves([[json.loads(line) for line in lines]]),
-            "reward.png": reward_figure(policy.config.task),
-            "rollout.png": rollout_figure(
-                policy_scene(policy), policy.config, {"policy": observing(policy)}
-            ),
+            "learning_curves.png": learning_curves([metrics]),
+            "reward.png": reward_figure(task),
+            "rollout.png": rollout_figure(scene, rollouts),
         }
         for name, figure in drawn.items():
-            figure.savefig(figures / name, bbox_inches="tight")
-            plt.close(figure)
-    return [figures / name for name in drawn]
+            (folder / name).write_bytes(png(figure))
+    return [folder / name for name in drawn]
+
+
+def png(figure: plt.Figure) -> bytes:
+    """A figure as the contents of a PNG file; the figure is closed."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, bbox_inches="tight")
+    plt.close(figure)
+    return buffer.getvalue()
 
 
 CURVES = (
@@ -136,57 +146,51 @@ def reward_figure(task: TaskConfig) -> plt.Figure:
     return figure
 
 
-def rollout_figure(
-    scene: Scene, config: Config, controllers: Mapping[str, Controller], suite: str = "paper"
-) -> plt.Figure:
-    """The paper's Fig. 7: board and body angles over 100 s in plain MuJoCo.
+def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
+    """The paper's Fig. 7: board and body angles over time in plain MuJoCo.
 
     Args:
-      scene: where.
-      config: the task.
-      controllers: name -> controller, drawn side by side on the same scenario.
-      suite: kind of scenario.
+      scene: of the rollouts.
+      rollouts: name -> the recorded rollout of one scenario, drawn side by side.
     """
     figure, axes = plt.subplots(
         4,
-        len(controllers),
-        figsize=(max(11, 6.5 * len(controllers)), 7),
+        len(rollouts),
+        figsize=(max(11, 6.5 * len(rollouts)), 7),
         sharex=True,
         sharey=True,
         squeeze=False,
         layout="constrained",
     )
-    limit = config.task.max_incline
-    for column, (name, controller) in zip(axes.T, controllers.items(), strict=True):
-        rollout = run_suite(
-            scene, config, controller, suite, 1, RECORD_SECONDS, RECORD_SEED, record=True
-        )
-        assert rollout.qpos is not None
-        qpos = rollout.qpos[0]
-        roll, pitch = roll_pitch(qpos[:, scene.trunk_quat])
-        time = np.arange(1, len(qpos) + 1) * config.task.sim_dt
-        board = np.degrees(qpos[:, scene.board_qpos])
-        rows = (
-            (board[:, 0], "board X", GREY),
-            (board[:, 1], "board Y", GREY),
-            (roll, "body roll", BLUE),
-            (pitch, "body pitch", ORANGE),
-        )
-        for axis, (values, label, colour) in zip(column, rows, strict=True):
-            axis.plot(time, values, color=colour, lw=1.2)
-            if axis in axes[:, 0]:
-                axis.set_ylabel(f"{label} [deg]")
-            axis.set_ylim(-1.05 * limit, 1.05 * limit)
-            axis.axhline(0, color="black", lw=0.5)
-            for change in np.arange(0, time[-1], config.task.target_period):
-                axis.axvline(change, color="black", lw=0.8, ls=":")
+    for column, (name, rollout) in zip(axes.T, rollouts.items(), strict=True):
+        _draw_rollout(column, scene, rollout)
         column[0].set_title(
             f"{name}: mean tilt {rollout.tilt.mean():.2f} deg, "
             f"greatest {rollout.tilt.max():.2f} deg"
             + (", the robot fell" if rollout.fell[0] else "")
         )
         column[-1].set_xlabel("time [s]; dotted: the board takes a new target")
+    for axis, name in zip(
+        axes[:, 0], ("board X", "board Y", "body roll", "body pitch"), strict=True
+    ):
+        axis.set_ylabel(f"{name} [deg]")
     return figure
+
+
+def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
+    """Board X, board Y, body roll and body pitch on four axes."""
+    assert rollout.qpos is not None, "the rollout is not recorded"
+    task, qpos = rollout.config.task, rollout.qpos[0]
+    time = np.arange(1, len(qpos) + 1) * task.sim_dt
+    board = np.degrees(qpos[:, scene.board_qpos])
+    roll, pitch = roll_pitch(qpos[:, scene.trunk_quat])
+    curves = ((board[:, 0], GREY), (board[:, 1], GREY), (roll, BLUE), (pitch, ORANGE))
+    for axis, (values, colour) in zip(column, curves, strict=True):
+        axis.plot(time, values, color=colour, lw=1.2)
+        axis.set_ylim(-1.05 * task.max_incline, 1.05 * task.max_incline)
+        axis.axhline(0, color="black", lw=0.5)
+        for change in np.arange(0, time[-1], task.target_period):
+            axis.axvline(change, color="black", lw=0.8, ls=":")
 
 
 def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figure:

@@ -1,26 +1,55 @@
-"""Classical controllers on the policy's own action set: what it is measured against. No JAX.
+"""Who acts: what a controller sees, and classical ones to measure a policy against. No JAX.
 
-`pd-imu` sees what the policy sees. The others cheat, each with more knowledge, and
-bound what any controller can do with these actions at this rate.
+The baselines act through the policy's own action set. `pd-imu` sees what the policy
+sees. The others cheat, each with more knowledge, and bound what any controller can do
+with these actions at this rate.
 """
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from mjx_balance.config import ACTION_AXES, Config
-from mjx_balance.plant import View, decision_ctrl, standing_heights
 from mjx_balance.scene import Scene
-from mjx_balance.task import tilt
-from mjx_balance.task.actions import apply_action, nearest_action
-from mjx_balance.task.reward import roll_pitch
+from mjx_balance.task import decision, tilt
+from mjx_balance.task.actions import nearest_action
+from mjx_balance.task.attitude import roll_pitch
 
 HORIZON = 8
 """Decisions that the predictive controllers look ahead."""
 SWEEPS = 25
 """Rounds of coordinate descent of the predictive controllers."""
+
+
+class View(NamedTuple):
+    """All there is to see when n scenarios of an evaluation take a decision.
+
+    A policy looks at `obs` alone; baselines may look at what no robot knows.
+    """
+
+    ids: np.ndarray
+    """(n,) numbers of these scenarios in the batch, for controllers with a memory."""
+    decision: int
+    """Decisions since the start."""
+    obs: np.ndarray
+    """(n, obs_size) the network's input."""
+    imu: np.ndarray
+    """(n, sim_steps, 6) IMU samples of the last decision."""
+    qpos: np.ndarray
+    """(n, nq) true positions."""
+    qvel: np.ndarray
+    """(n, nv) true velocities."""
+    scenario: tilt.Scenario
+    """Where the boards go."""
+    late: np.ndarray
+    """(n,) whether actions are taken one decision late."""
+
+
+Controller = Callable[[View], np.ndarray]
+"""Maps what there is to see of n scenarios to action indices (n,)."""
 
 
 class ControllerError(ValueError):
@@ -39,23 +68,24 @@ class Response:
 
 def measure_response(scene: Scene, config: Config) -> Response:
     """Takes one action on each axis, on the level board, and watches the body."""
-    task = config.task
+    task, robot = config.task, scene.robot
     size = task.action_max / 2
     gains, courses = [], []
     level = tilt.Scenario(np.zeros((1, 2)), np.zeros(()), np.asarray(task.board_rate))
     for axis in range(ACTION_AXES):
         data = mujoco.MjData(scene.model)
         data.qpos, data.qvel = scene.stance.qpos, scene.stance.qvel
-        before = standing_heights(config)
-        after = apply_action(task, config.robot, before, size * np.eye(ACTION_AXES)[axis])
+        memory = decision.start(task, robot, scene.stance.imu)
+        change = size * np.eye(ACTION_AXES)[axis]
         angles = []
-        for decision in range(HORIZON):
-            now = np.asarray(float(decision))
-            for ctrl in decision_ctrl(config, scene, level, now, before, after):
+        for number in range(HORIZON):
+            now = np.asarray(float(number))
+            memory, targets = decision.controls(task, robot, memory, change, None, level, now)
+            for ctrl in scene.ctrl(targets):
                 data.ctrl = ctrl
                 mujoco.mj_step(scene.model, data)
                 angles.append(roll_pitch(data.qpos[scene.trunk_quat])[axis])
-            before = after
+            change = 0 * change
         gains.append(angles[-1] / size)
         courses.append(np.asarray(angles) / angles[-1])
     return Response(np.asarray(gains), np.asarray(courses))
@@ -227,7 +257,7 @@ def as_it_will_be(task, scenario: tilt.Scenario, now: np.ndarray, ahead: np.ndar
     return angle[:, 1:] - angle[:, :1]
 
 
-CONTROLLERS: dict[str, Callable[[Scene, Config], Callable[[View], np.ndarray]]] = {
+CONTROLLERS: dict[str, Callable[[Scene, Config], Controller]] = {
     "none": Stand,
     "pd-imu": ImuPD,
     "pd-attitude": AttitudePD,
@@ -237,7 +267,7 @@ CONTROLLERS: dict[str, Callable[[Scene, Config], Callable[[View], np.ndarray]]] 
 """By the names of `mjx-balance evaluate --controller`."""
 
 
-def make_controller(name: str, scene: Scene, config: Config) -> Callable[[View], np.ndarray]:
+def make_controller(name: str, scene: Scene, config: Config) -> Controller:
     """Builds the controller called `name`; raises `ControllerError` with the known names."""
     if name not in CONTROLLERS:
         raise ControllerError(

@@ -4,15 +4,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_balance.config import RandomConfig, RobotConfig
+from mjx_balance.config import RandomizationConfig
+from mjx_balance.robots import Robot
 from mjx_balance.task import Array
 
 DRAWS = 6
-"""Uniform random numbers that one world's conditions take."""
+"""Uniform random numbers that the conditions of one env or scenario take."""
 
 
 class Conditions(NamedTuple):
-    """The circumstances of one world, or of a batch of them."""
+    """The circumstances of one env or scenario, or of a batch of them."""
 
     imu_noise: Array
     """(..., 6) standard deviation of every IMU sample, rad/s and m/s^2."""
@@ -28,11 +29,11 @@ class Conditions(NamedTuple):
     """(...) decisions between choosing an action and taking it, 0 or 1."""
 
 
-def draw_conditions(random: RandomConfig, robot: RobotConfig, uniform: Array) -> Conditions:
+def draw_conditions(ranges: RandomizationConfig, robot: Robot, uniform: Array) -> Conditions:
     """Turns random numbers into conditions.
 
     Args:
-      random: the ranges; those of the preset `paper` leave everything as it is.
+      ranges: how far things may differ; those of the preset `paper` leave everything as it is.
       robot: the nominal friction.
       uniform: (..., DRAWS) in [0, 1).
 
@@ -41,19 +42,19 @@ def draw_conditions(random: RandomConfig, robot: RobotConfig, uniform: Array) ->
     """
     xp = uniform.__array_namespace__()
     u = xp.moveaxis(uniform, -1, 0)
-    sigma = np.asarray([random.gyro_noise] * 3 + [random.accel_noise] * 3, uniform.dtype)
-    offset = random.payload_offset
+    sigma = np.asarray([ranges.gyro_noise] * 3 + [ranges.accel_noise] * 3, uniform.dtype)
+    offset = ranges.payload_offset
     at = xp.stack(
-        (offset * (2 * u[1] - 1), offset * (2 * u[2] - 1), 0 * u[0] + random.payload_height),
+        (offset * (2 * u[1] - 1), offset * (2 * u[2] - 1), 0 * u[0] + ranges.payload_height),
         axis=-1,
     )
-    friction_min = robot.foot_friction if random.friction_min is None else random.friction_min
-    friction_max = robot.foot_friction if random.friction_max is None else random.friction_max
+    friction_min = robot.foot_friction if ranges.friction_min is None else ranges.friction_min
+    friction_max = robot.foot_friction if ranges.friction_max is None else ranges.friction_max
     return Conditions(
         imu_noise=xp.zeros_like(u[0])[..., None] + sigma,
-        payload=random.payload * u[0],
+        payload=ranges.payload * u[0],
         payload_at=at,
         friction=friction_min + (friction_max - friction_min) * u[3],
-        gain=1 + random.gain_spread * (2 * u[4] - 1),
-        latency=(u[5] < random.latency_share).astype(uniform.dtype),
+        gain=1 + ranges.gain_spread * (2 * u[4] - 1),
+        latency=(u[5] < ranges.latency_share).astype(uniform.dtype),
     )

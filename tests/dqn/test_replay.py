@@ -84,3 +84,19 @@ def test_add_in_place_under_jit_equals_add() -> None:
         before, state = state, add(state, rows(1 + BATCH * k))
         assert before.data.obs.is_deleted(), "the old ring's memory is reused"
     jax.tree.map(np.testing.assert_array_equal, state, filled(5))
+
+
+def test_example_gives_shapes_and_types() -> None:
+    data = filled(0).data
+    assert data.obs.shape == (12, 2)
+    assert data.action.dtype == jnp.int32
+    assert data.terminated.dtype == jnp.float32
+
+
+def test_position_is_where_the_next_batch_goes() -> None:
+    for batches in range(8):
+        before, after = filled(batches), filled(batches + 1)
+        start = int(before.position)
+        assert start == BATCH * batches % 12
+        written = after.data.action[start : start + BATCH].tolist()
+        assert written == list(range(1 + BATCH * batches, 1 + BATCH * (batches + 1)))

@@ -1,6 +1,6 @@
-"""Advances one world by one decision in MJX.
+"""MJX: advances one env by one decision inside a jitted program.
 
-An engine is an `Advance`. The state holds only what a physics step reads, so that it
+An engine is an `Engine`. The state holds only what a physics step reads, so that it
 is cheap to carry, to reset and to save, and so that the environment need not know the
 engine behind it.
 """
@@ -13,17 +13,13 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
+from mjx_balance.config import Config
 from mjx_balance.scene import Scene
-from mjx_balance.task.reward import body_tilt
-
-SOLVER_ITERATIONS = 4
-"""Newton iterations in training. A batch waits for its slowest world, but fewer do not
-converge when a random policy lifts a foot: with one, robots jump (benchmarks/README.md)."""
-LINE_SEARCH_ITERATIONS = 6
+from mjx_balance.task.attitude import body_tilt
 
 
 class PhysicsState(NamedTuple):
-    """State of one world between physics steps."""
+    """State of one env between physics steps."""
 
     qpos: jax.Array
     """(nq,)"""
@@ -43,42 +39,47 @@ class Motion(NamedTuple):
 
 
 Advance = Callable[[PhysicsState, jax.Array, dict[str, jax.Array]], tuple[PhysicsState, Motion]]
-"""(state, ctrl (sim_steps, nu), model fields that differ in this world) -> (state, motion)."""
+"""(state, ctrl (sim_steps, nu), model fields that differ in this env) -> (state, motion)."""
 
 
-def initial_state(scene: Scene) -> PhysicsState:
-    """The standing state as float32 device arrays."""
-    stance = scene.stance
-    return PhysicsState(
-        jnp.asarray(stance.qpos, jnp.float32),
-        jnp.asarray(stance.qvel, jnp.float32),
-        jnp.asarray(stance.qacc_warmstart, jnp.float32),
-    )
+class Engine(NamedTuple):
+    """What an environment needs of a physics engine."""
+
+    initial: PhysicsState
+    """The settled stance."""
+    advance: Advance
+    """By one decision."""
 
 
-def mjx_advance(scene: Scene) -> Advance:
-    """Puts the scene's model on the device and returns its `Advance` for one world."""
+def mjx_engine(scene: Scene, config: Config) -> Engine:
+    """Puts the scene's model on the device, with the solver settings of the config."""
     training_model = copy.copy(scene.model)
-    training_model.opt.iterations = SOLVER_ITERATIONS
-    training_model.opt.ls_iterations = LINE_SEARCH_ITERATIONS
+    training_model.opt.iterations = config.solver_iterations
+    training_model.opt.ls_iterations = config.line_search_iterations
     with jax.ensure_compile_time_eval():  # constants, even where this runs inside a trace
         model = mjx.put_model(training_model)
         blank = mjx.make_data(training_model)
+        stance = scene.stance
+        initial = PhysicsState(
+            jnp.asarray(stance.qpos, jnp.float32),
+            jnp.asarray(stance.qvel, jnp.float32),
+            jnp.asarray(stance.qacc_warmstart, jnp.float32),
+        )
 
     def advance(
         state: PhysicsState, ctrl: jax.Array, fields: dict[str, jax.Array]
     ) -> tuple[PhysicsState, Motion]:
-        world = model.replace(**fields)
+        env_model = model.replace(**fields)
 
         def physics_step(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Motion]:
             data = blank.replace(**state._asdict(), ctrl=ctrl)
             # TF32 matrix products, the default on recent GPUs, are too coarse for contacts.
             with jax.default_matmul_precision("highest"):
-                data = mjx.step(world, data)
+                data = mjx.step(env_model, data)
             state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
             tilt = body_tilt(data.qpos[scene.trunk_quat])
             return state, Motion(data.sensordata[scene.imu], tilt)
 
         return jax.lax.scan(physics_step, state, ctrl)
 
-    return advance
+    return Engine(initial, advance)

@@ -8,11 +8,12 @@ its own pair of functions.
 
 import numpy as np
 
-from mjx_balance.config import RobotConfig, TaskConfig
+from mjx_balance.config import TaskConfig
+from mjx_balance.robots import Robot
 from mjx_balance.task import Array
 
 
-def joint_angles(robot: RobotConfig, heights: Array) -> Array:
+def joint_angles(robot: Robot, heights: Array) -> Array:
     """Inverse kinematics.
 
     Args:
@@ -30,11 +31,11 @@ def joint_angles(robot: RobotConfig, heights: Array) -> Array:
     return xp.stack((xp.zeros_like(hip), hip, knee), axis=-1)
 
 
-def foot_heights(robot: RobotConfig, angles: Array) -> Array:
+def foot_heights(robot: Robot, angles: Array) -> Array:
     """Forward kinematics, the inverse of `joint_angles`.
 
     Args:
-      robot: link lengths; its leg names say which side a leg is on.
+      robot: link lengths, sides of the legs.
       angles: (..., legs, 3) abduction, hip and knee angles, rad.
 
     Returns:
@@ -42,7 +43,7 @@ def foot_heights(robot: RobotConfig, angles: Array) -> Array:
     """
     xp = angles.__array_namespace__()
     abduction, hip, knee = angles[..., 0], angles[..., 1], angles[..., 2]
-    side = np.asarray([1.0 if name.startswith("L") else -1.0 for name in robot.legs])
+    side = np.where(robot.left, 1.0, -1.0)
     drop = robot.thigh * xp.cos(hip) + robot.calf * xp.cos(hip + knee)
     lateral = robot.abduction_offset * side.astype(angles.dtype) * xp.sin(abduction)
     return drop * xp.cos(abduction) - lateral + robot.foot_radius

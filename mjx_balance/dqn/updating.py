@@ -1,0 +1,117 @@
+"""One gradient step: reflections, loss, clipped Adam, target network."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from mjx_balance.config import DQNConfig
+from mjx_balance.dqn.devices import AXIS
+from mjx_balance.dqn.losses import td_error
+from mjx_balance.dqn.replay import Transition
+
+Params: TypeAlias = Any
+"""A network's variables, a flax pytree."""
+QValues: TypeAlias = Callable[[Params, jax.Array], jax.Array]
+"""Variables and observations (..., obs_size) -> action values (..., num_actions)."""
+
+
+class LearnerState(NamedTuple):
+    """The part of the training state that an update changes."""
+
+    params: Params
+    target_params: Params
+    opt_state: optax.OptState
+    gradient_steps: jax.Array
+
+
+class Symmetries(Protocol):
+    """Reflections of the env, g of them."""
+
+    @property
+    def obs_index(self) -> Any:
+        """(g, obs_size) entry of the observation that takes each place."""
+
+    @property
+    def obs_sign(self) -> Any:
+        """(g, obs_size) its sign there."""
+
+    @property
+    def action_index(self) -> Any:
+        """(g, num_actions) index that each action becomes."""
+
+
+def make_optimizer(config: DQNConfig, gradient_steps: int) -> optax.GradientTransformation:
+    """Adam with clipped gradients and a cosine from learning_rate to its end share."""
+    schedule = optax.cosine_decay_schedule(
+        config.learning_rate,
+        max(gradient_steps, 1),
+        config.learning_rate_end_share,
+    )
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
+
+
+def mirrored(symmetries: Symmetries, batch: Transition, key: jax.Array) -> Transition:
+    """Replaces each transition (batch, ...) by one of its reflections, chosen at random."""
+    which = jax.random.randint(key, batch.action.shape, 0, len(symmetries.obs_index))
+
+    def reflect(obs: jax.Array) -> jax.Array:
+        index = jnp.asarray(symmetries.obs_index)[which]
+        return jnp.take_along_axis(obs, index, axis=-1) * jnp.asarray(symmetries.obs_sign)[which]
+
+    return batch._replace(
+        obs=reflect(batch.obs),
+        next_obs=reflect(batch.next_obs),
+        action=jnp.asarray(symmetries.action_index)[which, batch.action],
+    )
+
+
+def loss(
+    params: Params,
+    target_params: Params,
+    batch: Transition,
+    q_values: QValues,
+    config: DQNConfig,
+) -> jax.Array:
+    """Mean squared TD error () of a batch (paper Eq. 1), or of Double DQN."""
+    q_tm1 = q_values(params, batch.obs)
+    q_t = q_values(target_params, batch.next_obs)
+    discount_t = config.gamma * (1 - batch.terminated)
+    selector = q_values(params, batch.next_obs) if config.double else None
+    error = jax.vmap(td_error, (0, 0, 0, 0, 0, None if selector is None else 0))(
+        q_tm1, batch.action, batch.reward, discount_t, q_t, selector
+    )
+    return jnp.mean(error**2)
+
+
+def update(
+    state: LearnerState,
+    batch: Transition,
+    q_values: QValues,
+    optimizer: optax.GradientTransformation,
+    config: DQNConfig,
+) -> tuple[LearnerState, jax.Array]:
+    """One gradient step on a batch of which each device has its share.
+
+    Args:
+      state: the same on every device, before and after.
+      batch: (share, ...) per field.
+      q_values: what the network makes of parameters and observations.
+      optimizer: from `make_optimizer`.
+      config: the algorithm.
+
+    Returns:
+      The state, and the loss () over all devices.
+    """
+    loss_and_grads = jax.value_and_grad(loss)
+    value, grads = loss_and_grads(state.params, state.target_params, batch, q_values, config)
+    value, grads = jax.lax.pmean((value, grads), AXIS)
+    updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+    params = optax.apply_updates(state.params, updates)
+    gradient_steps = state.gradient_steps + 1
+    target_params = optax.periodic_update(
+        params, state.target_params, gradient_steps, config.target_update_period
+    )
+    return LearnerState(params, target_params, opt_state, gradient_steps), value

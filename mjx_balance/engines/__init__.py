@@ -1,0 +1,1 @@
+"""Physics engines: each moves a scene by one decision."""

@@ -1,0 +1,25 @@
+"""Digest of the code that decides a result, so that a kept one is known to be out of date."""
+
+import hashlib
+from pathlib import Path
+
+import mujoco
+
+from mjx_balance import controllers, evaluation
+from mjx_balance.sources import PACKAGE, code
+
+
+def code_digest(package: Path = PACKAGE) -> str:
+    """Digest of the evaluation, the controllers, and whatever they import of the package.
+
+    MuJoCo's version counts, too; comments and docstrings decide nothing.
+
+    Args:
+      package: folder of mjx_balance.
+
+    Returns:
+      16 hexadecimal digits.
+    """
+    found = code(evaluation.__name__, package) | code(controllers.__name__, package)
+    parts = [mujoco.__version__, *(f"{name}:{text}" for name, text in sorted(found.items()))]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

@@ -1,0 +1,187 @@
+"""Policy and baselines on scenarios: everything that a report has to simulate."""
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_balance.controllers import CONTROLLERS, Controller, make_controller
+from mjx_balance.evaluation import (
+    Envelope,
+    Rollout,
+    envelope,
+    observing,
+    policy_scene,
+    run_suite,
+    summarize,
+)
+from mjx_balance.policy import Policy
+from mjx_balance.report.digest import code_digest
+from mjx_balance.report.reading import (
+    FOREIGN,
+    ReportError,
+    count,
+    number,
+    read_json,
+    section,
+    series,
+    suite_result,
+)
+from mjx_balance.scene import Scene
+from mjx_balance.suites import HEADLINE, SEEDS
+
+DURATION = 60.0
+ENVELOPE_SCENARIOS = 2
+ENVELOPE_DURATION = 30.0
+RECORD_SECONDS = 100.0
+"""As long as the paper's Fig. 7."""
+VIDEO_SECONDS = 12.0
+EDGES = np.concatenate(([0.0], np.geomspace(0.01, 6.0, 160), [6.0001]))
+"""Bins of the tilt distribution, deg."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """A policy beside the baselines, on the same scenarios."""
+
+    results: dict[str, dict[str, dict[str, Any]]]
+    """Controller -> suite -> `reading.suite_result`."""
+    shares: dict[str, dict[str, list[float]]]
+    """Controller -> suite -> share of the physics steps per bin of tilt between `EDGES`."""
+    envelope: Envelope
+    """Of the policy."""
+
+
+def measured(
+    policy: Policy, scene: Scene, file: Path, scenarios: int, progress: Callable[[str], Any]
+) -> Measured:
+    """Policy and baselines on the same scenarios; read back if it was done before.
+
+    Args:
+      policy: called `policy` in what is returned.
+      scene: the policy's.
+      file: what was measured before, and where it is kept.
+      scenarios: per suite and controller.
+      progress: title -> context manager that gives a callable taking the share done.
+    """
+    key = [policy.fingerprint, scene.hash, code_digest()]
+    key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
+    with contextlib.suppress(*FOREIGN):  # whatever else lies there, it is measured again
+        saved = read_json(file)
+        if saved["key"] == key:
+            return kept(saved)
+    found = _measure(policy, scene, scenarios, progress)
+    with contextlib.suppress(OSError):  # a folder that cannot be written keeps nothing
+        file.write_text(json.dumps({"key": key, **dataclasses.asdict(found)}) + "\n")
+    return found
+
+
+def kept(saved: dict[str, Any]) -> Measured:
+    """Checks what was read back, value by value.
+
+    Raises:
+      ReportError: for a value that was not measured.
+      KeyError: for one that is missing.
+    """
+    names = ("policy", *CONTROLLERS)
+    mapped = section(saved["envelope"])
+    inclines, rates = (_numbers(mapped[name], None) for name in ("inclines", "rates"))
+    return Measured(
+        results={
+            name: {suite: suite_result(saved["results"][name][suite], suite) for suite in HEADLINE}
+            for name in names
+        },
+        shares={
+            name: {
+                suite: _numbers(saved["shares"][name][suite], len(EDGES) - 1) for suite in HEADLINE
+            }
+            for name in names
+        },
+        envelope=Envelope(
+            inclines=inclines,
+            rates=rates,
+            fall_rate=_grid(mapped["fall_rate"], len(inclines), len(rates)),
+            mean_tilt=_grid(mapped["mean_tilt"], len(inclines), len(rates)),
+            authority=number(mapped["authority"], "authority"),
+            reach=number(mapped["reach"], "reach"),
+            scenarios=count(mapped["scenarios"], "scenarios"),
+            duration_s=number(mapped["duration_s"], "duration_s"),
+            seed=count(mapped["seed"], "seed"),
+        ),
+    )
+
+
+def _numbers(values: Any, size: int | None) -> list[float]:
+    found = [number(value, "a value") for value in series(values, "a row")]
+    if len(found) != (len(found) if size is None else size):
+        raise ReportError(f"a row holds {len(found)} values, not {size}")
+    return found
+
+
+def _grid(values: Any, rows: int, columns: int) -> list[list[float]]:
+    found = [_numbers(row, columns) for row in series(values, "a grid")]
+    if len(found) != rows:
+        raise ReportError(f"a grid holds {len(found)} rows, not {rows}")
+    return found
+
+
+def _measure(
+    policy: Policy, scene: Scene, scenarios: int, progress: Callable[[str], Any]
+) -> Measured:
+    results: dict[str, dict[str, Any]] = {}
+    shares: dict[str, dict[str, list[float]]] = {}
+    for name in ("policy", *CONTROLLERS):
+        results[name], shares[name] = {}, {}
+        for suite in HEADLINE:
+            controller = _controller(name, policy, scene)
+            with progress(f"{name}, suite {suite}") as bar:
+                rollout = run_suite(
+                    scene, policy.config, controller, suite, scenarios, DURATION, SEEDS.report, bar
+                )
+            summary = summarize(rollout, suite, DURATION, SEEDS.report)
+            results[name][suite] = suite_result(summary, suite)
+            counts, _ = np.histogram(rollout.tilt, EDGES)
+            shares[name][suite] = (counts / counts.sum()).tolist()
+    with progress("envelope") as bar:
+        mapped = envelope(
+            scene,
+            policy.config,
+            observing(policy),
+            ENVELOPE_SCENARIOS,
+            ENVELOPE_DURATION,
+            SEEDS.report,
+            bar,
+        )
+    return Measured(results, shares, mapped)
+
+
+def recorded(
+    policy: Policy,
+    suite: str,
+    duration: float,
+    seed: int,
+    controller: str = "policy",
+) -> Rollout:
+    """One scenario with every state, for a figure or a video.
+
+    Args:
+      policy: gives config and scene.
+      suite: kind of scenario.
+      duration: s.
+      seed: draws it.
+      controller: `policy`, or the name of a baseline that takes its place.
+
+    Raises:
+      PolicyError: if the policy belongs to another scene.
+    """
+    scene = policy_scene(policy)
+    chosen = _controller(controller, policy, scene)
+    return run_suite(scene, policy.config, chosen, suite, 1, duration, seed, record=True)
+
+
+def _controller(name: str, policy: Policy, scene: Scene) -> Controller:
+    return observing(policy) if name == "policy" else make_controller(name, scene, policy.config)

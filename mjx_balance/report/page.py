@@ -1,0 +1,304 @@
+"""One self-contained HTML page about runs, from the template beside this file."""
+
+import base64
+import dataclasses
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+import numpy as np
+
+from mjx_balance import render
+from mjx_balance.config import Config, flatten, preset, to_dict
+from mjx_balance.evaluation import policy_scene
+from mjx_balance.policy import Policy, PolicyError
+from mjx_balance.report import figures, measuring
+from mjx_balance.report.measuring import Measured
+from mjx_balance.report.reading import Run, read_run
+from mjx_balance.report.tables import spread
+from mjx_balance.run_folder import RunFolder
+from mjx_balance.scene import Scene
+from mjx_balance.statistics import TILTS, over_seeds
+from mjx_balance.suites import HEADLINE, SEEDS
+
+TEMPLATE = "page.html"
+SEES = {
+    "none": "stands still",
+    "pd-imu": "PD on a complementary filter of the same IMU",
+    "pd-attitude": "PD on the true attitude",
+    "rate-oracle": "predictive, true attitude and board rate",
+    "clairvoyant": "predictive, knows the board's future",
+}
+"""What each baseline knows."""
+KINDS = {
+    "paper": "targets in any direction",
+    "corner": "both axes at once, the case the paper's controller cannot handle",
+}
+"""What the suites of the headline try."""
+
+
+class Picture(NamedTuple):
+    """A figure of the page."""
+
+    title: str
+    png: str
+    """The file in base64."""
+    caption: str
+
+
+def write_report(
+    run_dirs: Sequence[Path],
+    out: Path,
+    scenarios: int,
+    progress: Callable[[str], Any],
+) -> list[str]:
+    """Writes one HTML file that needs nothing else.
+
+    The first run that has a policy is shown beside the baselines, on scenarios of the
+    report's own; what that takes is kept in its folder (`report.json`).
+
+    Args:
+      run_dirs: run folders, whole or not.
+      out: file to write.
+      scenarios: per suite and controller.
+      progress: title -> context manager that gives a callable taking the share done.
+
+    Returns:
+      What is missing, one sentence each.
+
+    Raises:
+      ReportError: for a folder that is no run folder.
+    """
+    runs = [read_run(path) for path in run_dirs]
+    missing = [sentence for run in runs for sentence in run.missing]
+    policy = next((run.policy for run in runs if run.policy is not None), None)
+    config = next((run.config for run in runs if run.config is not None), None)
+    shown: dict[str, Any] = {"comparison": None, "seeds": None, "pictures": [], "video": None}
+    for run in [run for run in runs if run.policy is not None][:1]:
+        try:
+            shown |= _show_policy(run, runs, scenarios, progress, missing)
+        except PolicyError as error:
+            missing.append(f"{run.path}: {error}")
+    page = {
+        "title": f"mjx_balance: {', '.join(run.path.name for run in runs)}",
+        "missing": missing,
+        **shown,
+        "training": training_pictures(runs, config),
+        "config": config and config_tables(config),
+        "commands": commands(runs, out),
+        "versions": policy and versions(policy),
+    }
+    # Surrogates, as file names may hold them, have no UTF-8.
+    out.write_bytes(render_page(page).encode("utf-8", "replace"))
+    return missing
+
+
+def render_page(page: dict[str, Any]) -> str:
+    """Fills the template; whatever the values hold, none of it becomes HTML."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(TEMPLATE).render(page)
+
+
+def _show_policy(
+    run: Run,
+    runs: Sequence[Run],
+    scenarios: int,
+    progress: Callable[[str], Any],
+    missing: list[str],
+) -> dict[str, Any]:
+    """Everything that is measured of a run's policy.
+
+    Raises:
+      PolicyError: if the policy belongs to another scene.
+    """
+    policy = run.policy
+    assert policy is not None
+    scene = policy_scene(policy)
+    found = measuring.measured(policy, scene, RunFolder(run.path).report, scenarios, progress)
+    shown: dict[str, Any] = {
+        "comparison": comparison(policy, found),
+        "seeds": seeds_table(run, runs),
+        "pictures": policy_pictures(policy, scene, found),
+    }
+    try:
+        shown["video"] = video(policy)
+        shown["video_note"] = (
+            f"{measuring.VIDEO_SECONDS:g} s of suite corner in plain MuJoCo, at real speed."
+        )
+    except render.RenderError as error:
+        missing.append(f"no video: {error}")
+    return shown
+
+
+def comparison(policy: Policy, found: Measured) -> dict[str, Any]:
+    """Headline figures, and the table of the policy against the baselines."""
+    ours = found.results["policy"]
+    count = ours["paper"]["scenarios"]
+    falls = sum(ours[suite]["falls"] for suite in HEADLINE)
+    tiles = [
+        (f"{ours['paper']['tilt_deg']['mean']:.3f}°", "mean tilt, targets in any direction"),
+        (f"{ours['corner']['tilt_deg']['mean']:.3f}°", "mean tilt, both axes at 7° at once"),
+        (str(falls), f"falls in {len(HEADLINE) * count} scenarios of {measuring.DURATION:g} s"),
+        (
+            f"{100 * found.envelope.fall_free_share:.0f}%",
+            "of the feasible envelope free of falls",
+        ),
+    ]
+    sees = {"policy": f"this network: {policy.observation_size} inputs", **SEES}
+    rows = [(name, sees[name], _baseline_cells(suites)) for name, suites in found.results.items()]
+    note = (
+        f"Plain MuJoCo, {count} held-out scenarios of {measuring.DURATION:g} s per suite (seed "
+        f"{SEEDS.report}), tilt in degrees over every physics step; from a fall on it counts as "
+        "6°. All take the same 21 x 21 actions at 5 Hz. The last column is the mean height change "
+        "commanded per decision in the last 3 s of each period. The paper gives no figures; it "
+        "reports a high peak of the tilt when the board turns on both axes at once, and that its "
+        "controller cannot handle that."
+    )
+    return {"tiles": tiles, "suites": HEADLINE, "rows": rows, "note": note}
+
+
+def _baseline_cells(suites: dict[str, dict[str, Any]]) -> list[str]:
+    """Falls, mean, p95 and max per suite, and what the controller does at rest."""
+    cells = []
+    for suite in HEADLINE:
+        cells.append(str(suites[suite]["falls"]))
+        cells += [f"{suites[suite]['tilt_deg'][name]:.3f}" for name in TILTS]
+    settled = suites["paper"]["action_mm_settled"]
+    return [*cells, "-" if settled is None else f"{settled:.3f}"]
+
+
+def seeds_table(shown: Run, runs: Sequence[Run]) -> dict[str, Any] | None:
+    """The training seeds of `shown` and of the runs that differ from it in the seed alone."""
+
+    def recipe(run: Run) -> Config | None:
+        return run.config and dataclasses.replace(run.config, seed=0, num_seeds=1)
+
+    alike = [run for run in runs if run is shown or (run.config and recipe(run) == recipe(shown))]
+    each = [result for run in alike for result in run.results]
+    shared = [suite for suite in HEADLINE if all(suite in result for result in each)]
+    if len(each) < 2 or not shared:
+        return None
+    rows = []
+    for suite in shared:
+        row = over_seeds([result[suite] for result in each])
+        cells = [str(row["seeds"]), f"{row['falls']} of {row['scenarios']}"]
+        for name in TILTS:
+            cells += [spread(row[name]), f"{row[name]['worst']:.3f}"]
+        rows.append((suite, cells))
+    return {"names": TILTS, "rows": rows}
+
+
+def policy_pictures(policy: Policy, scene: Scene, found: Measured) -> list[Picture]:
+    """The paper's Fig. 7 for each suite, the distribution of the tilt, and the envelope."""
+    drawn = []
+    for suite in HEADLINE:
+        both = {
+            name: measuring.recorded(policy, suite, measuring.RECORD_SECONDS, SEEDS.record, name)
+            for name in ("policy", "pd-imu")
+        }
+        caption = (
+            f"The paper's Fig. 7 for suite {suite} ({KINDS[suite]}), beside the PD on the same IMU."
+        )
+        figure = figures.rollout_figure(scene, both)
+        drawn.append(
+            _picture(f"{measuring.RECORD_SECONDS:g} s on the board: {suite}", figure, caption)
+        )
+    shares = {name: np.asarray(suites["paper"]) for name, suites in found.shares.items()}
+    figure = figures.tilt_figure(shares, measuring.EDGES)
+    caption = "Suite paper, every physics step of every scenario."
+    drawn.append(_picture("Tilt distribution", figure, caption))
+    mapped = found.envelope
+    caption = (
+        f"Targets on both axes at once, {mapped.scenarios} scenarios of {mapped.duration_s:g} s "
+        "per cell. Right of or above the dashed line the action set cannot follow: 3 mm five "
+        f"times a second turn the body at {mapped.authority:.2f} deg/s in pitch, and the legs "
+        f"reach {mapped.reach:.1f} deg. Inside, {100 * mapped.fall_free_share:.0f}% of the cells "
+        "are free of falls."
+    )
+    figure = figures.envelope_figure(mapped, policy.config.task.fail_tilt)
+    return [*drawn, _picture("Envelope", figure, caption)]
+
+
+def video(policy: Policy) -> str:
+    """A recorded scenario as MP4 in base64; raises `RenderError` where none can be drawn."""
+    rollout = measuring.recorded(policy, "corner", measuring.VIDEO_SECONDS, SEEDS.report)
+    assert rollout.qpos is not None
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "video.mp4"
+        render.write(file, policy.config, rollout.qpos[0])
+        return base64.b64encode(file.read_bytes()).decode()
+
+
+def training_pictures(runs: Sequence[Run], config: Config | None) -> list[Picture]:
+    """Learning curves, and the reward that was learnt from."""
+    drawn = []
+    curves = [run.metrics for run in runs if run.metrics]
+    if curves:
+        caption = (
+            "Training. The line is the median over runs and seeds, the band their extremes; tilt, "
+            "falls and reward are those of the exploring policy."
+        )
+        drawn.append(_picture("Learning curves", figures.learning_curves(curves), caption))
+    if config is not None:
+        end = config.task.reward_tilt == "end"
+        where = "at the decision's end" if end else "averaged over it"
+        caption = f"The reward of one decision; the tilt is taken {where}."
+        figure = figures.reward_figure(config.task)
+        drawn.append(_picture("Reward (Fig. 4 and 5 of the paper)", figure, caption))
+    return drawn
+
+
+def _picture(title: str, figure: figures.plt.Figure, caption: str) -> Picture:
+    return Picture(title, base64.b64encode(figures.png(figure)).decode(), caption)
+
+
+def config_tables(config: Config) -> dict[str, Any]:
+    """What differs from the paper's preset, and everything."""
+    papers = flatten(to_dict(preset("paper")))
+    differs = [
+        (name, papers[name], value)
+        for name, value in flatten(to_dict(config)).items()
+        if value != papers[name]
+    ]
+    return {"differs": differs, "everything": json.dumps(to_dict(config), indent=2)}
+
+
+def commands(runs: Sequence[Run], out: Path) -> list[str]:
+    """Command lines that train, evaluate and report again."""
+    lines = [train_command(run.config) for run in runs if run.config is not None]
+    for run in runs:
+        if run.policy is not None:
+            lines.append(f"mjx-balance evaluate {RunFolder(run.path).policy} --suite corner")
+    return [*lines, f"mjx-balance report {' '.join(str(run.path) for run in runs)} --out {out}"]
+
+
+def train_command(config: Config) -> str:
+    """The command that trains with this config."""
+    theirs = flatten(to_dict(preset(config.preset)))
+    words = [f"mjx-balance train --preset {config.preset} --seed {config.seed}"]
+    for name, value in flatten(to_dict(config)).items():
+        if value == theirs[name] or name == "seed":
+            continue
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            some = value if isinstance(value, list) else [value]
+            words.append(" ".join([f"--{flag}", *map(str, some)]))
+    return " ".join(words)
+
+
+def versions(policy: Policy) -> str:
+    """What the policy was trained with, as far as its manifest tells."""
+    known = policy.manifest.get("versions")
+    some = known.items() if isinstance(known, dict) else ()
+    return ", ".join(f"{name} {version}" for name, version in some if version)

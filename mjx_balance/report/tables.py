@@ -1,0 +1,81 @@
+"""Tables for a terminal of 80 columns."""
+
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from mjx_balance.run_folder import RunFolder
+from mjx_balance.statistics import TILTS
+
+SHOWN = ("mean", "p50", "p95", "p99", "max")
+"""Tilt statistics of an evaluation that its table shows."""
+
+
+def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
+    """One row per suite.
+
+    Args:
+      results: suite -> JSON of `evaluation.summarize`.
+    """
+    table = _suites_table("plain MuJoCo, tilt in deg over every physics step")
+    for name in ("scenarios", "falls", *SHOWN, "act mm"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for suite, result in results.items():
+        table.add_row(
+            suite,
+            f"{result['scenarios']} x {result['duration_s']:g} s",
+            str(result["falls"]),
+            *(f"{result['tilt_deg'][name]:.3f}" for name in SHOWN),
+            f"{result['action_mm_mean']:.3f}",
+        )
+    return table
+
+
+def seeds_table(summary: dict[str, dict[str, Any]]) -> Table:
+    """One row per suite, interquartile means over the training seeds.
+
+    Args:
+      summary: suite -> `statistics.over_seeds`.
+    """
+    seeds = max(row["seeds"] for row in summary.values())
+    table = _suites_table(f"{seeds} seeds: interquartile mean, 95% bootstrap interval, tilt in deg")
+    for name in ("falls", *TILTS):
+        table.add_column(name, justify="right", no_wrap=True)
+    for suite, row in summary.items():
+        table.add_row(suite, str(row["falls"]), *(spread(row[name]) for name in TILTS))
+    return table
+
+
+def spread(value: dict[str, float]) -> str:
+    """An interquartile mean and its interval, e.g. `0.081 (0.079-0.084)`."""
+    return f"{value['iqm']:.3f} ({value['low']:.3f}-{value['high']:.3f})"
+
+
+def print_summary(
+    console: Console, run_dir: Path, results: dict[str, dict[str, Any]], seconds: float
+) -> None:
+    """Says how the run went and where everything is."""
+    folder = RunFolder(run_dir)
+    console.print(evaluation_table(results))
+    for path, what in (
+        (folder.policy, "the policy; `mjx-balance evaluate` runs it"),
+        (folder.evaluation, "the table above"),
+        (f"{folder.figures}/", "learning curves, rewards, 100 s on the board"),
+        (folder.metrics, f"every logged number; {folder.tensorboard.name}/ has them too"),
+        (f"{folder.checkpoints}/", "the whole training state"),
+    ):
+        console.print(f"{path}  [dim]{what}[/dim]", highlight=False, soft_wrap=True)
+    console.print(f"`mjx-balance report {run_dir}` makes a page of it", highlight=False)
+    console.print(f"done in {seconds:.0f} s", highlight=False)
+
+
+def _suites_table(title: str) -> Table:
+    """One row per suite, its name in the first column; narrow."""
+    table = Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )
+    table.add_column("suite", style="bold", no_wrap=True)
+    return table

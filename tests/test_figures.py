@@ -1,0 +1,235 @@
+"""What a reader of the figures reads: values, axes, units and labels, from the drawn artists."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
+from scipy.spatial.transform import Rotation
+
+from mjx_balance.config import Config
+from mjx_balance.evaluation import Envelope, Rollout
+from mjx_balance.report import figures
+from mjx_balance.scene import Scene
+
+NAMES = (
+    "train/tilt_deg",
+    "train/falls_per_minute",
+    "train/reward",
+    "train/loss",
+    "train/epsilon",
+    "perf/env_steps_per_second",
+)
+
+
+def metrics_line(env_steps: int, values: list[float], **seeds: list[float]) -> dict[str, Any]:
+    """A line of metrics.jsonl; `values` in the order of `NAMES`."""
+    line = {"env_steps": env_steps} | dict(zip(NAMES, values, strict=True))
+    return line | ({"seeds": seeds} if seeds else {})
+
+
+def data(axis: Axes, line: int = 0) -> np.ndarray:
+    """(points, 2) x and y of a line."""
+    return np.asarray(axis.get_lines()[line].get_xydata())
+
+
+def test_learning_curves_show_each_metric_under_its_name() -> None:
+    lines = [metrics_line(500 * k, [k + 0.1 * n for n in range(6)]) for k in (1, 2, 4)]
+    figure = figures.learning_curves([lines])
+    titles = [
+        "mean body tilt [deg]",
+        "falls per robot-minute",
+        "reward per decision",
+        "squared TD error",
+        "epsilon",
+        "decisions per second",
+    ]
+    scales = ["log", "symlog", "linear", "log", "linear", "linear"]
+    for n, (axis, title, scale) in enumerate(zip(figure.axes, titles, scales, strict=True)):
+        assert title in (axis.get_title(), axis.get_title(loc="left"))
+        assert axis.get_yscale() == scale
+        expected = [(0.5, 1 + 0.1 * n), (1.0, 2 + 0.1 * n), (2.0, 4 + 0.1 * n)]
+        np.testing.assert_allclose(data(axis), expected)
+        assert axis.get_xlabel() == ("thousand decisions" if n >= 3 else "")
+        assert not axis.collections, "one curve has no band"
+    bottoms = [axis.get_ylim()[0] for axis in figure.axes]
+    assert [bottoms[n] for n in (1, 4, 5)] == [0, 0, 0]
+
+
+def test_learning_curves_show_the_median_and_the_extremes_over_seeds() -> None:
+    lines = [
+        metrics_line(1_000 * k, [9.0] * 6, tilt_deg=[1.0 * k, 5.0 * k, 2.0 * k]) for k in (1, 2)
+    ]
+    figure = figures.learning_curves([lines])
+    np.testing.assert_allclose(data(figure.axes[0]), [(1, 2), (2, 4)])
+    band = figure.axes[0].collections[0]
+    assert isinstance(band, FillBetweenPolyCollection)
+    corners = {tuple(x) for x in np.asarray(band.get_paths()[0].vertices, float).round(9).tolist()}
+    assert corners == {(1, 1), (2, 2), (1, 5), (2, 10)}
+    np.testing.assert_allclose(data(figure.axes[2])[:, 1], 9, err_msg="not logged by seed")
+
+
+def test_learning_curves_join_runs_over_the_longest_of_them() -> None:
+    long = [metrics_line(1_000 * k, [2.0 * k] * 6) for k in (1, 2, 3, 4)]
+    short = [metrics_line(2_000, [10.0] * 6), metrics_line(3_000, [10.0] * 6)]
+    figure = figures.learning_curves([short, long])
+    # Before and after the short run there is the long one alone; where both are, their median.
+    np.testing.assert_allclose(data(figure.axes[0]), [(1, 2), (2, 7), (3, 8), (4, 8)])
+
+
+def test_learning_curves_leave_out_what_is_no_number_or_no_loss_yet() -> None:
+    losses = (0.0, 0.0, 0.5, np.nan, 0.25)
+    lines = [metrics_line(1_000 * k, [1, 0, -1, x, 0, 1]) for k, x in enumerate(losses, 1)]
+    figure = figures.learning_curves([lines])
+    np.testing.assert_allclose(data(figure.axes[3]), [(3, 0.5), (5, 0.25)])
+    np.testing.assert_allclose(data(figure.axes[1])[:, 1], 0, err_msg="no falls are shown as 0")
+    np.testing.assert_allclose(data(figure.axes[2])[:, 1], -1)
+    assert figure.axes[2].get_ylim()[0] < -1, "a negative reward can be seen"
+
+
+def test_reward_figure_is_equation_4_and_our_figure_5(config: Config) -> None:
+    task = dataclasses.replace(config.task, reward_toward=0.8, reward_toward_scale=1.6)
+    left, right = figures.reward_figure(task).axes
+    tilt, reward = data(left).T
+    assert (tilt[0], tilt[-1]) == (0, 6)
+    np.testing.assert_allclose(reward, 0.4 * np.exp(-1.5 * tilt), rtol=1e-6)
+    (gain, up), (loss, down) = data(right, 0).T, data(right, 1).T
+    assert (gain[0], gain[-1]) == (-2, 2)
+    np.testing.assert_allclose(up[gain >= 0], 0.8 * np.clip(gain[gain >= 0] / 1.6, -1, 1))
+    np.testing.assert_allclose(down[loss <= 0], 0.8 * np.clip(loss[loss <= 0] / 1.6, -1, 1))
+    assert np.isnan(up[gain < 0]).all()
+    assert np.isnan(down[loss > 0]).all()
+    assert (left.get_xlabel(), left.get_ylabel()) == ("body tilt [deg]", "reward")
+    assert right.get_xlabel() == "tilt before less tilt after [deg]"
+
+
+def test_tilt_figure_shows_the_share_beyond_each_tilt() -> None:
+    shares = {"policy": np.array([0.5, 0.3, 0.2, 0.0]), "none": np.array([0.0, 0.0, 0.0, 1.0])}
+    axis = figures.tilt_figure(shares, np.array([0.0, 0.1, 1.0, 2.0, 5.0])).axes[0]
+    policy, none = data(axis, 0), data(axis, 1)
+    np.testing.assert_allclose(policy[:, 0], [0.1, 1.0, 2.0, 5.0])
+    np.testing.assert_allclose(policy[:, 1], [0.5, 0.2, np.nan, np.nan])
+    np.testing.assert_allclose(none[:, 1], [1.0, 1.0, 1.0, np.nan])
+    legend = axis.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["policy", "none"]
+    assert axis.get_lines()[0].get_linewidth() > axis.get_lines()[1].get_linewidth()
+    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
+    assert axis.get_xlim() == (0.02, 5.0)
+    assert axis.get_xlabel() == "body tilt [deg]"
+
+
+def test_envelope_figure_has_speed_to_the_right_and_incline_upward() -> None:
+    envelope = Envelope(
+        inclines=[2.0, 4.0, 6.0],
+        rates=[2.5, 3.5],
+        fall_rate=[[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]],
+        mean_tilt=[[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]],
+        authority=3.25,
+        reach=5.5,
+        scenarios=2,
+        duration_s=30.0,
+        seed=0,
+    )
+    figure = figures.envelope_figure(envelope, 7.5)
+    falls, tilt = figure.axes[:2]
+    for axis, values, top, title in (
+        (falls, envelope.fall_rate, 1.0, "share of the scenarios with a fall"),
+        (tilt, envelope.mean_tilt, 7.5, "mean body tilt [deg]"),
+    ):
+        mesh = next(c for c in axis.collections if isinstance(c, QuadMesh))
+        np.testing.assert_allclose(np.asarray(mesh.get_array()).reshape(3, 2), values)
+        corners = np.asarray(mesh.get_coordinates(), float)
+        centres = (corners[:-1, :-1] + corners[1:, 1:]) / 2
+        np.testing.assert_allclose(centres[..., 0], np.tile([2.5, 3.5], (3, 1)))
+        np.testing.assert_allclose(centres[..., 1], np.tile([[2.0], [4.0], [6.0]], 2))
+        assert mesh.get_clim() == (0, top)
+        assert mesh.colorbar is not None
+        np.testing.assert_allclose(data(axis), [(2.5, 5.5), (3.25, 5.5), (3.25, 2.0)])
+        assert axis.get_lines()[0].get_linestyle() == "--"
+        assert title in (axis.get_title(), axis.get_title(loc="left"))
+        assert axis.get_xlabel() == "board speed on each axis [deg/s]"
+    assert falls.get_ylabel() == "board angle on both axes at once [deg]"
+
+
+def made_up_rollout(
+    config: Config, scene: Scene, fell_at: int, level: float = 0.0
+) -> tuple[Rollout, dict[str, np.ndarray]]:
+    """22 s of a board and a body whose four angles, in deg, are all different."""
+    steps = 5_500
+    time = 0.004 * np.arange(1, steps + 1)
+    angles = {
+        "board X": 4 * np.sin(time) + level,
+        "board Y": 2 * np.cos(time / 3),
+        "body roll": np.sin(5 * time) + 0.5,
+        "body pitch": 0.3 * np.cos(7 * time) - 1,
+    }
+    turned = Rotation.from_euler(
+        "ZYX",
+        np.stack((np.full(steps, 33.0), angles["body pitch"], angles["body roll"]), axis=-1),
+        degrees=True,
+    )
+    qpos = np.tile(scene.stance.qpos, (1, steps, 1))
+    qpos[0][:, scene.board_qpos[0]] = np.radians(angles["board X"])
+    qpos[0][:, scene.board_qpos[1]] = np.radians(angles["board Y"])
+    qpos[0][:, scene.trunk_quat] = turned.as_quat(scalar_first=True)
+    tilt = np.full((1, steps), 0.25)
+    tilt[0, :1_100] = 1.0
+    rollout = Rollout(
+        config=config,
+        tilt=tilt,
+        fell_at=np.array([fell_at]),
+        action_mm=np.zeros((1, 110)),
+        qpos=qpos,
+        seconds=1.0,
+    )
+    return rollout, {"time": time} | angles
+
+
+def test_rollout_figure_shows_each_angle_in_its_row(config: Config, scene: Scene) -> None:
+    standing, angles = made_up_rollout(config, scene, fell_at=5_500)
+    fallen, others = made_up_rollout(config, scene, fell_at=5_499, level=1.5)
+    figure = figures.rollout_figure(scene, {"policy": standing, "none": fallen})
+    axes = np.asarray(figure.axes).reshape(4, 2)
+    for row, name in enumerate(("board X", "board Y", "body roll", "body pitch")):
+        for axis, expected in zip(axes[row], (angles, others), strict=True):
+            curve = data(axis)
+            np.testing.assert_allclose(curve[:, 0], expected["time"])
+            np.testing.assert_allclose(curve[:, 1], expected[name], atol=1e-9)
+            dotted = [line for line in axis.get_lines() if line.get_linestyle() == ":"]
+            changes = [np.asarray(line.get_xdata(), float)[0] for line in dotted]
+            assert changes == [0, 10, 20], "a new target every 10 s"
+            assert axis.get_ylim() == pytest.approx((-7.35, 7.35)), "the steepest board fits"
+        assert [axis.get_ylabel() for axis in axes[row]] == [f"{name} [deg]", ""]
+    titles = ["".join(axis.get_title(loc=x) for x in ("left", "center")) for axis in axes[0]]
+    assert titles == [
+        "policy: mean tilt 0.40 deg, greatest 1.00 deg",  # a fifth of the time 1, else 0.25
+        "none: mean tilt 0.40 deg, greatest 1.00 deg, the robot fell",
+    ]
+    assert axes[3, 0].get_xlabel() == "time [s]; dotted: the board takes a new target"
+
+
+def test_a_runs_figures_are_drawn_from_what_they_are_given(
+    config: Config, scene: Scene, tmp_path: Path
+) -> None:
+    lines = [metrics_line(1_000, [1.0] * 6), metrics_line(2_000, [0.5] * 6)]
+    rollout, _ = made_up_rollout(config, scene, 5_500)
+    folder = tmp_path / "figures"
+    files = figures.draw_figures(folder, lines, config.task, scene, {"policy": rollout})
+    assert [file.name for file in files] == ["learning_curves.png", "reward.png", "rollout.png"]
+    assert sorted(folder.iterdir()) == sorted(files)
+    sizes = [imageio.imread(file).shape[:2] for file in files]
+    for (height, width), (tall, wide) in zip(sizes, ((6, 12), (3.4, 9), (7, 11)), strict=True):
+        assert 140 * wide < width < 160 * wide, "150 dots per inch"
+        assert 140 * tall < height < 160 * tall
+    assert not figures.plt.get_fignums(), "nothing stays in memory"
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    figures.plt.close("all")

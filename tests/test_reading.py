@@ -1,0 +1,204 @@
+"""What is read of a run folder: all there is, checked, and one sentence for the rest."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjx_balance.report import reading
+
+HOSTILE = "<img src=x onerror=alert(1)>"
+
+
+def metrics_line(k: int, seeds: int) -> dict[str, Any]:
+    names = "tilt_deg falls_per_minute reward loss epsilon".split()
+    line: dict[str, Any] = {"env_steps": 1024 * (k + 1), "gradient_steps": k}
+    line |= {f"train/{name}": 1 / (k + 1) for name in names}
+    line |= {"perf/env_steps_per_second": 500.0, "perf/physics_steps_per_second": 25_000.0}
+    if seeds > 1:
+        values = [(n + 1) / (k + 1) for n in range(seeds)]
+        line["seeds"] = dict.fromkeys(("tilt_deg", "reward", "loss"), values)
+    return line
+
+
+def evaluation_result(suite: str, tilt: float) -> dict[str, Any]:
+    keys = ("mean", "rms", "p50", "p95", "p99", "max")
+    return {"suite": suite, "scenarios": 8, "falls": 1, "tilt_deg": dict.fromkeys(keys, tilt)}
+
+
+GOOD_LINE = json.dumps(metrics_line(0, 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("config.json", "[]", "config.json cannot be used: Config is []; it must map"),
+        ("config.json", '{"task": []}', "config.json cannot be used: TaskConfig is []"),
+        ("config.json", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a number"),
+        ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_st', "metrics.jsonl is shown up to line 2"),
+        ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_steps": 9999}}', "it has no 'train/tilt_deg'"),
+        ("metrics.jsonl", f"{GOOD_LINE}\n5", "metrics.jsonl is shown up to line 2"),
+        (
+            "metrics.jsonl",
+            f"{GOOD_LINE}\n{GOOD_LINE}",
+            "line 2, which cannot be used: env_steps is 1",
+        ),
+        ("seeds.json", '{"best": 1}', "seeds.json cannot be used: it has no 'seeds'"),
+        ("seeds.json", "[1]", "seeds.json cannot be used: it is [1]; it must be a JSON object"),
+        ("seeds.json", '{"seeds": {}}', "seeds is {}; it must be a list"),
+        ("seeds.json", f'{{"seeds": [{", ".join(["1"] * 1001)}]}}', "it holds 1001 seeds"),
+        ("evaluation.json", '{"paper": {"falls": 0}}', "evaluation.json cannot be used: it has no"),
+        ("evaluation.json", '{"paper": 1}', "paper is 1; it must be a JSON object"),
+        ("evaluation.json", "[" * 100_000, "evaluation.json cannot be used: it is nested too deep"),
+        ("evaluation.json", "9" * 5_000, "evaluation.json cannot be used: it is no JSON: Exceeds"),
+        ("evaluation.json", " " * (2**21 + 1), "it is 2.0 MiB long; at most 2 MiB are read"),
+        ("evaluation.json", b"\xff\xfe\x00{", "evaluation.json cannot be used: it is no JSON"),
+        ("evaluation.json", '{"\\u001b[2J\\ud800": 1}', "cannot be used: ?[2J? is 1; it must"),
+        (
+            "metrics.jsonl",
+            f"{GOOD_LINE}\n" + " " * 2**19,
+            "line 2, which cannot be used: it is longer",
+        ),
+        ("config.json", b"\x80", "config.json cannot be used: it is no JSON"),
+    ],
+)
+def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_read(
+    tmp_path: Path, name: str, content: str | bytes, said: str
+) -> None:
+    (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    run = reading.read_run(tmp_path)
+    assert said in "\n".join(run.missing)
+    assert len(run.metrics) == 1
+    assert all(len(sentence) < 500 for sentence in run.missing)
+
+
+def test_a_folder_in_a_files_place_is_said(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
+    for name in ("config.json", "seeds.json"):
+        (tmp_path / name).mkdir()
+    said = reading.read_run(tmp_path).missing
+    assert f"{tmp_path / 'config.json'} is no file" in said
+    assert f"{tmp_path / 'evaluation.json'} is missing" in said
+
+
+HUGE = 10**400
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "said"),
+    [
+        ("falls", HOSTILE, "falls is '<img"),
+        ("falls", "1", "falls is '1'; it must be a whole number of at least 0"),
+        ("falls", True, "falls is True; it must be a whole number"),
+        ("falls", 1.5, "falls is 1.5; it must be a whole number"),
+        ("falls", -1, "falls is -1; it must be a whole number of at least 0"),
+        ("falls", HUGE, "falls is 1000"),
+        ("falls", 9, "falls is 9; it must not exceed scenarios, 8"),
+        ("scenarios", [8], "scenarios is [8]; it must be a whole number"),
+        ("scenarios", None, "scenarios is None"),
+        ("scenarios", HOSTILE, "scenarios is '<img"),
+        ("tilt_deg", HOSTILE, "tilt_deg is '<img"),
+        ("mean", HOSTILE, "mean is '<img"),
+        ("mean", False, "mean is False; it must be a number"),
+        ("p95", float("nan"), "p95 is nan; it must be finite"),
+        ("max", float("inf"), "max is inf; it must be finite"),
+        ("max", HUGE, "max is 1000"),
+        ("max", None, "max is None"),
+    ],
+)
+def test_results_are_numbers(tmp_path: Path, where: str, value: Any, said: str) -> None:
+    for name in ("evaluation.json", "seeds.json"):
+        results = {suite: evaluation_result(suite, 0.1) for suite in ("paper", "corner")}
+        results["corner"].update({where: value} if where in results["corner"] else {})
+        if where in results["corner"]["tilt_deg"]:
+            results["corner"]["tilt_deg"][where] = value
+        whole: Any = results if name == "evaluation.json" else {"seeds": [{"evaluation": results}]}
+        folder = tmp_path / name.removesuffix(".json")
+        folder.mkdir()
+        (folder / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
+        (folder / name).write_text(json.dumps(whole))
+        run = reading.read_run(folder)
+        assert run.results == []
+        sentences = [sentence for sentence in run.missing if f"{name} cannot be used" in sentence]
+        assert said in sentences[0]
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        ("env_steps", "1024"),
+        ("env_steps", -1),
+        ("env_steps", 1024.5),
+        ("env_steps", HUGE),
+        ("train/loss", HOSTILE),
+        ("train/loss", None),
+        ("train/loss", HUGE),
+        ("perf/env_steps_per_second", True),
+        ("seeds", HOSTILE),
+        ("seeds", {"loss": HOSTILE}),
+        ("seeds", {"loss": 1.0}),
+        ("seeds", {"loss": [1.0, HOSTILE]}),
+        ("seeds", {"loss": []}),
+    ],
+)
+def test_metrics_are_numbers(tmp_path: Path, where: str, value: Any) -> None:
+    bad = metrics_line(1, 1) | {where: value}
+    (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n{json.dumps(bad)}\n")
+    run = reading.read_run(tmp_path)
+    assert len(run.metrics) == 1
+    assert "metrics.jsonl is shown up to line 2, which cannot be used: " in "".join(run.missing)
+
+
+def test_seeds_that_change_along_the_way_are_refused(tmp_path: Path) -> None:
+    lines = [metrics_line(0, 3), metrics_line(1, 2)]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    run = reading.read_run(tmp_path)
+    assert len(run.metrics) == 1
+    assert "other seeds than in line 1" in "".join(run.missing)
+
+
+def test_a_loss_that_is_no_number_is_a_gap(tmp_path: Path) -> None:
+    lines = [metrics_line(k, 2) for k in range(3)]
+    lines[1]["train/loss"] = float("nan")
+    lines[1]["seeds"] = dict(lines[1]["seeds"], loss=[float("-inf"), 1.0])
+    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    run = reading.read_run(tmp_path)
+    assert len(run.metrics) == 3
+    assert np.isnan(run.metrics[1]["train/loss"])
+    np.testing.assert_array_equal(run.metrics[1]["seeds"]["loss"], [np.nan, 1.0])
+
+
+def test_of_long_metrics_the_beginning_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = [json.dumps(metrics_line(k, 1)) for k in range(4)]
+    monkeypatch.setattr(reading, "METRICS_BYTES", len("\n".join(texts[:3])) - 1)
+    (tmp_path / "metrics.jsonl").write_text("\n".join(texts))
+    run = reading.read_run(tmp_path)
+    assert [line["env_steps"] for line in run.metrics] == [1024, 2048], "the third is cut off"
+    assert "metrics.jsonl is 0.0 MiB long; its first 0 MiB are shown" in "".join(run.missing)
+
+
+def test_only_what_the_report_shows_is_kept(tmp_path: Path) -> None:
+    line = metrics_line(0, 2) | {"train/note": HOSTILE, "more": [HOSTILE]}
+    line["seeds"] = {"loss": [1, 2.5], "note": [HOSTILE]}
+    (tmp_path / "metrics.jsonl").write_text(json.dumps(line))
+    result = evaluation_result("paper", 0.25) | {"note": HOSTILE}
+    (tmp_path / "evaluation.json").write_text(json.dumps({"paper": result}))
+    run = reading.read_run(tmp_path)
+    assert run.metrics[0]["seeds"] == {"loss": [1.0, 2.5]}
+    assert run.metrics[0]["train/tilt_deg"] == 1.0
+    tilt = {"mean": 0.25, "p95": 0.25, "max": 0.25}
+    expected = {"scenarios": 8, "falls": 1, "tilt_deg": tilt, "action_mm_settled": None}
+    assert run.results == [{"paper": expected}]
+    assert "<" not in repr((run.metrics, run.results))
+
+
+def test_metrics_without_a_line_are_said(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    (tmp_path / "metrics.jsonl").write_text("")
+    said = "\n".join(reading.read_run(tmp_path).missing)
+    assert "metrics.jsonl cannot be used: it holds no line yet" in said

@@ -1,0 +1,31 @@
+"""First episodes end at different times, later ones have their whole length."""
+
+import dataclasses
+
+import jax
+import numpy as np
+from fleet import ENVS, EPISODE, Fleet
+
+from mjx_balance.training.devices import make_learner, size_to_device
+
+
+def test_first_episodes_are_of_every_length(fleet: Fleet) -> None:
+    keys = jax.random.split(jax.random.PRNGKey(0), 20 * EPISODE)
+    state = jax.jit(jax.vmap(fleet.env.reset_staggered))(keys)
+    left = np.asarray(state.info["decisions_left"])
+    # Uniform over 1 to EPISODE: each 20 times, within 5 standard deviations.
+    counts = np.bincount(left, minlength=EPISODE + 1)
+    assert counts[0] == 0
+    assert len(counts) == EPISODE + 1
+    assert np.abs(counts[1:] - 20).max() < 5 * np.sqrt(20)
+    assert len(np.unique(np.asarray(state.info["scenario"].phase))) > 0.99 * len(keys)
+
+
+def test_a_later_episode_has_its_whole_length(fleet: Fleet) -> None:
+    left = fleet.reset(jax.random.split(jax.random.PRNGKey(1), ENVS)).info["decisions_left"]
+    assert (np.asarray(left) == EPISODE).all()
+
+
+def test_a_run_begins_with_staggered_episodes(fleet: Fleet) -> None:
+    sized = size_to_device(dataclasses.replace(fleet.env.config, num_envs=ENVS))
+    assert make_learner(sized, fleet.env).first_reset == fleet.env.reset_staggered

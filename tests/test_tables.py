@@ -1,0 +1,71 @@
+"""Tables of a terminal: every cell under its heading, in 80 columns."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from mjx_balance.report import tables
+
+FRICTION = {
+    "scenarios": 100_000,
+    "duration_s": 60.0,
+    "falls": 1_280,
+    "tilt_deg": {
+        "mean": 0.0684,
+        "rms": 0.9,
+        "p50": 0.0316,
+        "p95": 0.2345,
+        "p99": 0.6789,
+        "max": 6.0,
+    },
+    "action_mm_mean": 0.2468,
+}
+CORNER = FRICTION | {"scenarios": 8, "duration_s": 2.5, "falls": 0}
+
+
+def printed(table: object) -> list[list[str]]:
+    """Title, headings and rows as words."""
+    out = io.StringIO()
+    Console(width=80, file=out).print(table)
+    lines = [line for line in out.getvalue().splitlines() if line.strip(" ─")]
+    assert "…" not in out.getvalue(), "nothing is cut off"
+    return [line.split() for line in lines]
+
+
+def test_evaluation_table() -> None:
+    title, heads, friction, corner = printed(
+        tables.evaluation_table({"friction": FRICTION, "corner": CORNER})
+    )
+    assert " ".join(title) == "plain MuJoCo, tilt in deg over every physics step"
+    assert heads == "suite scenarios falls mean p50 p95 p99 max act mm".split()
+    assert friction == "friction 100000 x 60 s 1280 0.068 0.032 0.234 0.679 6.000 0.247".split()
+    assert corner[:6] == "corner 8 x 2.5 s 0".split()
+
+
+def test_seeds_table() -> None:
+    row: dict[str, Any] = {"seeds": 5, "scenarios": 640, "falls": 1_280}
+    for k, name in enumerate(("mean", "p95", "max")):
+        row[name] = {"iqm": k + 0.0684, "low": k + 0.0677, "high": k + 1.0687, "worst": 7.0}
+    title, heads, friction, corner = printed(
+        tables.seeds_table({"friction": row, "corner": row | {"seeds": 3, "falls": 2}})
+    )
+    assert " ".join(title).startswith("5 seeds: interquartile mean, 95% bootstrap interval")
+    assert heads == "suite falls mean p95 max".split()
+    cells = "0.068 (0.068-1.069) 1.068 (1.068-2.069) 2.068 (2.068-3.069)".split()
+    assert friction == ["friction", "1280", *cells]
+    assert corner == ["corner", "2", *cells]
+
+
+def test_the_summary_names_every_file_of_the_run() -> None:
+    out = io.StringIO()
+    run = Path("runs/a")
+    tables.print_summary(Console(width=80, file=out), run, {"corner": CORNER}, 61.6)
+    text = out.getvalue()
+    for name in ("policy.safetensors", "evaluation.json", "figures/", "metrics.jsonl"):
+        assert f"runs/a/{name}" in text
+    assert "runs/a/checkpoints/  the whole training state" in text
+    assert "`mjx-balance report runs/a` makes a page of it" in text
+    assert "0.068" in text
+    assert text.endswith("done in 62 s\n")
