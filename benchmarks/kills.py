@@ -22,7 +22,7 @@ from mjx_balance.training.checkpoints import saved_steps
 
 REPO = Path(__file__).resolve().parent.parent
 FLAGS = (
-    "--preset smoke --num-env-steps 6144 --eval-scenarios 4 --eval-duration 5 "
+    "--preset smoke --num-env-steps 3072 --eval-scenarios 4 --eval-duration 5 "
     "--log-every 512 --checkpoint-seconds 1"
 ).split()
 LIMIT_S = 600.0
