@@ -11,8 +11,10 @@ import psutil
 import pytest
 
 from mjx_balance.config import ConfigError, preset
+from mjx_balance.dqn import learner as learner_module
+from mjx_balance.env import BalanceEnv
 from mjx_balance.training import devices
-from mjx_balance.training.devices import check_memory, size_to_device
+from mjx_balance.training.devices import check_memory, make_learner, size_to_device
 
 CONFIG = preset("default")
 
@@ -70,6 +72,35 @@ def test_a_replay_smaller_than_one_decision_of_all_envs_is_refused() -> None:
     dqn = dataclasses.replace(CONFIG.dqn, replay_capacity=255, min_replay_size=10)
     with pytest.raises(ConfigError, match="replay_capacity is 255; it must hold at least one"):
         size_to_device(dataclasses.replace(CONFIG, dqn=dqn))
+
+
+@pytest.mark.parametrize(
+    ("head", "factors"), [("joint", (441,)), ("factored", (21, 21)), ("radial", (21, 21))]
+)
+def test_the_learner_is_the_configs(
+    head: Any, factors: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lengths: list[int] = []
+    make = learner_module.make_optimizer
+    monkeypatch.setattr(
+        learner_module, "make_optimizer", lambda dqn, n: (lengths.append(n), make(dqn, n))[1]
+    )
+    dqn = dataclasses.replace(CONFIG.dqn, head=head, hidden_sizes=(8, 4), replay_ratio=512.0)
+    config = dataclasses.replace(
+        CONFIG, num_envs=32, num_devices=1, num_env_steps=320, num_seeds=3, dqn=dqn
+    )
+    env = BalanceEnv(config)
+    learner = make_learner(config, env)
+    network = learner.network
+    assert (network.hidden_sizes, network.factors) == ((8, 4), factors)
+    assert network.radial == (head == "radial")
+    assert (learner.env, learner.config) == (env, dqn)
+    assert (learner.num_envs, learner.num_devices, learner.num_seeds) == (32, 1, 3)
+    assert learner.action_factors == (21, 21)
+    assert learner.symmetries is not None
+    assert learner.first_reset == env.reset_staggered
+    # 10 decisions of 32 envs, each transition replayed 512 times in batches of 512.
+    assert lengths == [320]
 
 
 MIB = 2**20

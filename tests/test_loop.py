@@ -20,7 +20,7 @@ import pytest
 from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event
 
-from mjx_balance.config import Config, TaskConfig
+from mjx_balance.config import PRESETS, Config, TaskConfig
 from mjx_balance.display import Display
 from mjx_balance.run_folder import RunFolder
 from mjx_balance.training import checkpoints, loop
@@ -116,6 +116,20 @@ def test_every_call_is_logged_and_the_end_is_saved(
     assert [line["gradient_steps"] for line in logged(folder)] == [3, 6, 9, 12, 15]
     assert checkpoints.saved_steps(folder.checkpoints) == [100]
     assert 0 < seconds < 10
+    assert "100/100 decisions" in display.console.file.getvalue()  # pyright: ignore
+    drawn = {
+        value.tag: value.simple_value
+        for event in events(folder)
+        for value in event.summary.value
+        if event.step == 100
+    }
+    last = {name: value for name, value in logged(folder)[-1].items() if "/" in name}
+    assert len(last) == 7
+    assert drawn == pytest.approx(last, rel=1e-6)
+
+
+def test_checkpoints_are_at_most_a_minute_old() -> None:
+    assert all(config.checkpoint_seconds <= 50 for config in PRESETS.values())
 
 
 def test_names_and_units_of_what_is_logged() -> None:
@@ -186,7 +200,7 @@ def test_checkpoints_come_by_the_clock(
 ) -> None:
     """Every call takes a second: saved after each 2.5 s means after the third, the sixth, ..."""
     now = [0.0]
-    clock = types.SimpleNamespace(monotonic=lambda: now[0], perf_counter=time.perf_counter)
+    clock = types.SimpleNamespace(monotonic=lambda: now[0], perf_counter=lambda: 10 * now[0])
     monkeypatch.setattr(loop, "time", clock)
     saved: list[int] = []
     save = checkpoints.save
@@ -201,7 +215,10 @@ def test_checkpoints_come_by_the_clock(
         now[0] += 1
         return step(state)
 
-    run(folder, display, stop, second, PLAN._replace(checkpoint_seconds=every))
+    zero: Any = start()
+    plan = PLAN._replace(checkpoint_seconds=every)
+    assert learn(plan, second, zero, folder, display, stop)[1] == pytest.approx(50)
+    assert logged(folder)[3]["perf/env_steps_per_second"] == pytest.approx(2)
     assert checkpoints.saved_steps(folder.checkpoints) == steps
     if every == 2.0:
         assert saved == [40, 80, 100]

@@ -102,6 +102,23 @@ def test_a_folder_exists_only_once_it_can_be_resumed(
     create_run_folder(tmp_path / "run", CONFIG, TODAY)
 
 
+def test_the_names_are_those_of_the_contract(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    names = "config.json metrics.jsonl tensorboard checkpoints policy.safetensors evaluation.json"
+    assert [
+        folder.config,
+        folder.metrics,
+        folder.tensorboard,
+        folder.checkpoints,
+        folder.policy,
+        folder.evaluation,
+    ] == [tmp_path / name for name in names.split()]
+    assert folder.figures == tmp_path / "figures"
+    assert folder.report == tmp_path / "report.json"
+    assert folder.seeds_summary == tmp_path / "seeds.json"
+    assert folder.seed_policy(3) == tmp_path / "seeds" / "seed-3.safetensors"
+
+
 def test_an_existing_folder_and_an_unwritable_one_are_refused(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(RunFolderError, match=r"run folder .*mine exists; choose another"):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 
 from mjx_balance import load_policy
 from mjx_balance.run_folder import RunFolder
+from mjx_balance.training.checkpoints import saved_steps
 
 REPO = Path(__file__).parent.parent
 FLAGS = (
@@ -28,6 +30,10 @@ PATIENCE_S = 300.0
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cache of its own, cold at first."""
     return tmp_path_factory.mktemp("cache")
+
+
+def cores() -> int:
+    return os.cpu_count() or 1
 
 
 class Done(NamedTuple):
@@ -68,6 +74,10 @@ def run(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     done = end(start(cache, *FLAGS, "--run-dir", str(folder.path)))
     assert done.code == 0, done.said
     assert "Failed to import" not in done.said
+    used = re.search(r"preset smoke, seed 0, 64 envs on (\d+) (\w+) device", done.said)
+    assert used is not None, done.said
+    if used[2] == "cpu":  # as many cores as share 64 envs evenly
+        assert int(used[1]) == max(n for n in (1, 2, 4, 8, 16, 32, 64) if n <= cores())
     return folder
 
 
@@ -129,6 +139,7 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
     assert done.code == -signal.SIGKILL, done.said
     assert len(lines(folder)) < 6, "the kill came too late to show anything"
 
+    saved = max(saved_steps(folder.checkpoints))
     before = len(list(folder.tensorboard.iterdir()))
     at_work = resume()
     # A TensorBoard file is opened when the loop begins.
@@ -138,7 +149,8 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
     assert "stopping after this call and saving" in done.said
     assert f"continue with --resume {folder.path}" in done.said
     so_far = load_policy(folder.policy).manifest["training"]["env_steps"]
-    assert so_far < 6144
+    assert saved < so_far < 6144
+    assert f"resuming at {saved:,} decisions" in done.said
 
     done = interrupt(resume(), signal.SIGKILL, lambda: len(lines(folder)) == 6)
     assert done.code == -signal.SIGKILL, done.said
@@ -146,6 +158,7 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
 
     done = end(resume())
     assert done.code == 0, done.said
+    assert "resuming at 6,144 decisions" in done.said
     assert load_policy(folder.policy).fingerprint == load_policy(run.policy).fingerprint
     assert [x["env_steps"] for x in lines(folder)] == list(range(1024, 6145, 1024))
     evaluations = [json.loads(x.evaluation.read_text()) for x in (run, folder)]
