@@ -99,7 +99,7 @@ class Walk(Probe):
 
     Observes (walk, steps taken); `walk` is drawn by the reset. Action a earns
     10 walk + steps + a / 2. The third step ends the walk, in a termination after action 1,
-    by time after action 0: the last observation, (walk, 3), is none of a reset.
+    by time after any other: the last observation, (walk, 3), is none of a reset.
     """
 
     @property
@@ -115,7 +115,7 @@ class Walk(Probe):
     def step(self, state: State, action: jax.Array) -> State:
         walk, steps = jnp.asarray(state.obs)
         last = steps == 2
-        ends, late = last & (action == 1), last & (action == 0)
+        ends, late = last & (action == 1), last & (action != 1)
         after = self._next(state, 0.0, 10 * walk + steps + action / 2, ends, late)
         obs = jnp.stack((walk, steps + 1))
         return after.replace(obs=obs, metrics={"steps": steps + 1})
@@ -158,3 +158,46 @@ class NoTimeLimit(NoisyState):
 
     def step(self, state: State, action: jax.Array) -> State:
         return super().step(state, action).replace(info={})
+
+
+class Faulty(NoisyState):
+    """As NoisyState, but some steps show something that is not a finite number.
+
+    Observations carry a second number, 1 in envs that can fail; resets make those alone.
+
+    Args:
+      faults: what is shown by an observation, a reward, by done or by the observation of a
+        reset, each at its own random steps.
+      rate: share of the steps in which each happens.
+    """
+
+    def __init__(self, faults: dict[str, float], rate: float):
+        self.faults, self.rate = faults, rate
+
+    @property
+    def observation_size(self) -> int:
+        return 2
+
+    def reset(self, rng: jax.Array) -> State:
+        key_obs, key_fault, key = jax.random.split(rng, 3)
+        obs = jnp.stack((jnp.asarray(super().reset(key_obs).obs)[0], 1.0))
+        obs = self._spoilt("reset", key_fault, obs, obs[1])
+        state = super().reset(rng)
+        metrics = {"mine": jnp.float32(1.0)}
+        return state.replace(obs=obs, info=state.info | {"key": key}, metrics=metrics)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        keys = jax.random.split(state.info["key"], 4)
+        x, able = jnp.asarray(state.obs)
+        after = self._next(state, 0.0, x * (2.0 * action - 1), terminated=1.0)
+        return after.replace(
+            obs=self._spoilt("obs", keys[0], jnp.stack((0 * x, able)), able),
+            reward=self._spoilt("reward", keys[1], after.reward, able),
+            done=self._spoilt("done", keys[2], after.done, able),
+            info=after.info | {"key": keys[3]},
+        )
+
+    def _spoilt(self, where: str, key: jax.Array, value: jax.Array, able: jax.Array) -> jax.Array:
+        if where not in self.faults:
+            return value
+        return jnp.where(able * jax.random.bernoulli(key, self.rate), self.faults[where], value)

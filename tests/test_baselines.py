@@ -92,6 +92,12 @@ def test_gains_are_arguments(config: Config, scene: Scene) -> None:
     assert controller(view).tolist() == [21 * 7 + 10]
 
 
+def test_gains_are_those_that_the_benchmark_found_best(config: Config, scene: Scene) -> None:
+    imu, true = ImuPD(scene, config), AttitudePD(scene, config)
+    assert (imu.proportional, imu.rate, imu.tau, imu.samples) == (1.2, 0.14, 4.0, 1)
+    assert (true.proportional, true.rate) == (1.3, 0.12)
+
+
 def test_complementary_filter_sample_by_sample(config: Config, scene: Scene) -> None:
     """Predict by the gyro, lean toward gravity's direction; worlds keep their own angle."""
     rng = np.random.default_rng(0)

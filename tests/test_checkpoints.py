@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from mjx_balance.training.checkpoints import CheckpointError, restore, save, saved_steps
 
@@ -132,3 +133,26 @@ def test_any_damage_is_found_out(
     else:
         file.unlink()
     assert restored(folder) == 5
+
+
+def test_a_state_comes_back_to_its_devices(tmp_path: Path) -> None:
+    """One that is spread over two devices, counters and keys and all kinds of numbers in it."""
+    mesh = Mesh(np.asarray(jax.devices()), ("devices",))
+    assert mesh.size == 2
+    spread = NamedSharding(mesh, PartitionSpec("devices"))
+    same = NamedSharding(mesh, PartitionSpec())
+    state = {
+        "rows": jax.device_put(np.arange(12.0, dtype=np.float32).reshape(6, 2), spread),
+        "key": jax.device_put(jax.random.PRNGKey(3), same),
+        "flags": jax.device_put(np.asarray([True, False]), spread),
+        "none": (),
+        "special": jax.device_put(np.asarray([np.nan, np.inf, -0.0], np.float32), same),
+    }
+    save(tmp_path, 1, state)
+    saved = restore(tmp_path, jax.tree.map(jnp.zeros_like, state), pytest.fail)
+    assert saved is not None
+    assert jax.tree.structure(saved) == jax.tree.structure(state)
+    for name in ("rows", "key", "flags", "special"):
+        assert saved[name].dtype == state[name].dtype
+        assert saved[name].sharding == state[name].sharding
+        assert np.asarray(saved[name]).tobytes() == np.asarray(state[name]).tobytes()

@@ -222,6 +222,25 @@ def test_tilt_counts_six_from_the_very_step_of_the_fall(config: Config, scene: S
     np.testing.assert_array_equal(still, np.tile(last, (len(still), 1)))
 
 
+def test_who_fell_is_out_even_if_it_rights_itself(config: Config, scene: Scene) -> None:
+    """One step overshoots by a little: a limit between its peak and its end ends the scenario."""
+    scenarios = level_boards(config, 1, 1.0)
+    course = roll_out(scene, config, always(LEFT_UP), scenarios, 0.2).tilt[0]
+    limit = float(course.max() + course[-1]) / 2
+    assert course[-1] < limit < course.max()
+    strict = dataclasses.replace(config, task=dataclasses.replace(config.task, fail_tilt=limit))
+    calls = []
+
+    def once(view: View) -> np.ndarray:
+        calls.append(view.decision)
+        return np.full(1, LEFT_UP if view.decision == 0 else STAND)
+
+    rollout = roll_out(scene, strict, once, scenarios, 1.0)
+    assert calls == [0]
+    assert rollout.fell_at[0] == np.flatnonzero(course > limit)[0]
+    assert (rollout.tilt[0, rollout.fell_at[0] :] == limit).all()
+
+
 def test_the_standing_are_shown_their_own_world_when_others_have_fallen(
     config: Config, scene: Scene
 ) -> None:
@@ -344,10 +363,10 @@ def test_settled_action_leaves_out_the_fallen(config: Config) -> None:
 
 
 def grid(falls: list[list[float]]) -> Envelope:
-    """Inclines 2, 6 and 20 deg by 3, 4 and 9 deg/s, of which 6 and 4 can still be met."""
+    """Inclines 2, 6 and 20 deg by 3, 4 and 5 deg/s, of which 6 and 4 can still be met."""
     return Envelope(
         inclines=[2.0, 6.0, 20.0],
-        rates=[3.0, 4.0, 9.0],
+        rates=[3.0, 4.0, 5.0],
         fall_rate=falls,
         mean_tilt=falls,
         authority=4.0,

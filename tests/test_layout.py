@@ -19,7 +19,10 @@ FLOORS = (
         *"task.actions task.attitude task.kinematics task.observation task.randomization".split(),
         *"task.reward task.symmetry task.tilt dqn dqn.heads dqn.devices".split(),
     ),
-    ("task.decision", *"dqn.acting dqn.networks dqn.replay dqn.losses dqn.whitening".split()),
+    (
+        "task.decision",
+        *"dqn.acting dqn.means dqn.networks dqn.replay dqn.losses dqn.whitening".split(),
+    ),
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner"),
     ("engines", "engines.mjx", "engines.mujoco", "controllers"),

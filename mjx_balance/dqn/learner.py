@@ -11,7 +11,7 @@ seed axis and the iteration is vmapped over it.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +23,14 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import replay, whitening
 from mjx_balance.dqn.acting import epsilon, explore
-from mjx_balance.dqn.collecting import Metrics, Reset, array, collect, fresh
+from mjx_balance.dqn.collecting import Collected, Reset, array, collect, finite, fresh
 from mjx_balance.dqn.devices import AXIS, device_key
+from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.dqn.replay import ReplayState, Transition
 from mjx_balance.dqn.updating import (
     LearnerState,
     Params,
-    QValues,
     Symmetries,
     make_optimizer,
     mirrored,
@@ -39,6 +39,7 @@ from mjx_balance.dqn.updating import (
 from mjx_balance.dqn.whitening import InputStatistics
 
 REPLICATED = PartitionSpec()
+Metrics: TypeAlias = dict[str, jax.Array]
 
 
 class TrainState(NamedTuple):
@@ -50,9 +51,10 @@ class TrainState(NamedTuple):
     params: Params
     """Of a network that takes whitened observations, where `whiten_steps` asks for that."""
     target_params: Params
+    """Of one that takes raw observations, as `params` were when it was last copied."""
     opt_state: optax.OptState
     inputs: InputStatistics
-    """Mean and covariance of the observations."""
+    """What is known of the observations."""
     env_state: State
     """(num_envs, ...) per leaf, sharded."""
     replay: ReplayState
@@ -143,15 +145,22 @@ class Learner:
         """The jitted training program: state -> (state, metrics), the state donated.
 
         Args:
-          iterations: decisions of every env per call. Metrics are means over them, with a
-            leading seed axis if there are several seeds.
+          iterations: decisions of every env per call. Metrics are means over what happened
+            in them, with a leading seed axis if there are several seeds; NaN if nothing did,
+            as for the loss of a call without an update.
         """
+        iteration = self._each_seed(self.iteration, in_axes=(0, None))
+
+        def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, Mean]]:
+            # The same for all seeds: asked here, the branch not taken costs nothing.
+            watching = state.env_steps.max() < self.config.whiten_steps
+            return iteration(state, watching)
 
         def program(state: TrainState) -> tuple[TrainState, Metrics]:
             self.trace_count += 1
-            step = self._each_seed(self.iteration)
-            state, metrics = jax.lax.scan(lambda s, _: step(s), state, length=iterations)
-            return state, jax.tree.map(lambda x: x.mean(axis=0), metrics)
+            state, metrics = jax.lax.scan(step, state, length=iterations)
+            totals = jax.tree.map(lambda x: x.sum(axis=0), metrics)
+            return state, {name: mean.value() for name, mean in totals.items()}
 
         return jax.jit(
             jax.shard_map(
@@ -166,11 +175,16 @@ class Learner:
 
     def exported(self, state: TrainState) -> Params:
         """The parameters of one run (no seed axis) for a network that takes raw observations."""
-        whiten = self._whitener(state.inputs)
-        return state.params if whiten is None else self.network.folded(state.params, *whiten)
+        return self._folded(state.params, state.inputs)
 
-    def _each_seed(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        return jax.vmap(function) if self.num_seeds > 1 else function
+    def _folded(self, params: Params, inputs: InputStatistics) -> Params:
+        """Folds the whitening in: the small kernel instead of every observation."""
+        if not self.config.whiten_steps:
+            return params
+        return self.network.folded(params, inputs.mean, inputs.matrix)
+
+    def _each_seed(self, function: Callable[..., Any], in_axes: Any = 0) -> Callable[..., Any]:
+        return jax.vmap(function, in_axes) if self.num_seeds > 1 else function
 
     def initial(self, key: jax.Array) -> TrainState:
         """The state of one new run; runs on each device."""
@@ -179,13 +193,14 @@ class Learner:
         env_state = fresh(self.first_reset, device_key(key_env), local_envs)
         obs = array(env_state.obs)[0]
         params = self.network.init(key_params, obs)
+        inputs = whitening.init(len(obs), self.config.whiten_floor)
         scalar = jnp.float32(0.0)
         example = Transition(obs, jnp.int32(0), scalar, scalar, obs)
         return TrainState(
             params=params,
-            target_params=jax.tree.map(jnp.copy, params),
+            target_params=jax.tree.map(jnp.copy, self._folded(params, inputs)),
             opt_state=self.optimizer.init(params),
-            inputs=whitening.init(obs.shape[-1]),
+            inputs=inputs,
             env_state=env_state,
             replay=replay.init(
                 example, self.config.replay_capacity // self.num_devices, local_envs
@@ -195,61 +210,79 @@ class Learner:
             key=key,
         )
 
-    def iteration(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        """One decision of every env of one run, then its updates; runs on each device."""
+    def iteration(
+        self, state: TrainState, watching: jax.Array
+    ) -> tuple[TrainState, dict[str, Mean]]:
+        """One decision of every env of one run, then its updates; runs on each device.
+
+        Args:
+          state: of one run, this device's part.
+          watching: () whether observations still add to the input statistics.
+        """
         key, key_act, key_reset, key_learn = jax.random.split(state.key, 4)
         rate = epsilon(self.config, state.env_steps)
-        if self.config.whiten_steps:
-            state = state._replace(inputs=self._watch(state))
-        q_values = self._q_values(self._whitener(state.inputs))
-        env_state, transition, metrics = self._collect(state, q_values, rate, key_act, key_reset)
+        inputs = jax.lax.cond(watching, self._watch, lambda state: state.inputs, state)
+        state = state._replace(inputs=inputs)
+        seen = self._collect(state, rate, key_act, key_reset)
         state = state._replace(
-            env_state=env_state,
-            replay=replay.add(state.replay, transition),
+            env_state=seen.env_state,
+            replay=replay.add(state.replay, seen.transition, seen.storable),
             env_steps=state.env_steps + self.num_envs,
             key=key,
         )
-        state, loss = self._learn(state, q_values, device_key(key_learn))
-        return state, metrics | {"loss": loss, "epsilon": rate}
+        state, loss = self._learn(state, device_key(key_learn))
+        return state, seen.metrics | loss | {"epsilon": Mean(rate, jnp.float32(1.0))}
+
+    def _watch(self, state: TrainState) -> InputStatistics:
+        """Takes the present observations of all devices into account."""
+        obs = array(state.env_state.obs)
+        sound = jax.vmap(finite)(obs)[:, None]
+        count = jax.lax.psum(sound.sum(), AXIS)
+        mean: jax.Array = jax.lax.psum(jnp.where(sound, obs, 0.0).sum(axis=0), AXIS) / count
+        away = jnp.where(sound, obs - mean, 0.0)
+        covariance = jax.lax.psum(away.T @ away, AXIS) / count
+        seen = whitening.update(state.inputs, mean, covariance, self.config.whiten_floor)
+        usable = finite(seen)  # not if no observation was, or their squares are beyond numbers
+        return jax.tree.map(lambda new, old: jnp.where(usable, new, old), seen, state.inputs)
 
     def _collect(
-        self,
-        state: TrainState,
-        q_values: QValues,
-        rate: jax.Array,
-        key_act: jax.Array,
-        key_reset: jax.Array,
-    ) -> tuple[State, Transition, Metrics]:
+        self, state: TrainState, rate: jax.Array, key_act: jax.Array, key_reset: jax.Array
+    ) -> Collected:
         """Takes one decision of each of this device's envs."""
         obs = array(state.env_state.obs)
-        values = q_values(state.params, obs)
+        values = self._q_values(self._folded(state.params, state.inputs), obs)
         keys = jax.random.split(device_key(key_act), len(obs))
         act = partial(explore, factors=self.action_factors, levels=self.config.exploration_noise)
         action = jax.vmap(act, (0, 0, None))(keys, values, rate)
         return collect(self.env, state.env_state, action, device_key(key_reset))
 
-    def _learn(
-        self, state: TrainState, q_values: QValues, key: jax.Array
-    ) -> tuple[TrainState, jax.Array]:
-        """Makes one iteration's updates, once the replay is warm; returns the mean loss."""
+    def _learn(self, state: TrainState, key: jax.Array) -> tuple[TrainState, dict[str, Mean]]:
+        """Makes one iteration's updates, once the replay is warm.
+
+        Returns:
+          The state; `loss` over the updates made, and `skipped_updates`, the share of those
+          that were not because something was not finite.
+        """
         # The cosine runs over the updates of a whole run; none is made before the warm-up.
         capacity = state.replay.data.action.shape[0]
         wanted = min(self.config.min_replay_size // self.num_devices, capacity)
+        ready = state.replay.size >= wanted
         keys = jax.random.split(key, self.updates)
+        fold = partial(self._folded, inputs=state.inputs)
+        nothing = Mean(jnp.float32(0.0), jnp.float32(0.0))
 
-        def step(learner: LearnerState, key: jax.Array) -> tuple[LearnerState, jax.Array]:
-            return update(
-                learner, self._batch(state.replay, key), q_values, self.optimizer, self.config
-            )
+        def step(learner: LearnerState, key: jax.Array) -> tuple[LearnerState, Mean]:
+            batch = self._batch(state.replay, key)
+            return update(learner, batch, self._q_values, fold, self.optimizer, self.config)
+
+        def learn(learner: LearnerState) -> tuple[LearnerState, Mean]:
+            learner, losses = jax.lax.scan(step, learner, keys)
+            return learner, jax.tree.map(jnp.sum, losses)
 
         before = LearnerState(*(getattr(state, name) for name in LearnerState._fields))
-        after, losses = jax.lax.cond(
-            state.replay.size >= wanted,
-            lambda learner: jax.lax.scan(step, learner, keys),
-            lambda learner: (learner, jnp.zeros(self.updates)),
-            before,
-        )
-        return state._replace(**after._asdict()), losses.mean()
+        after, loss = jax.lax.cond(ready, learn, lambda learner: (learner, nothing), before)
+        skips = Mean(ready * (self.updates - loss.number), jnp.float32(self.updates))
+        return state._replace(**after._asdict()), {"loss": loss, "skipped_updates": skips}
 
     def _batch(self, buffer: ReplayState, key: jax.Array) -> Transition:
         """This device's share of a batch, reflected if asked for."""
@@ -257,27 +290,7 @@ class Learner:
         batch = replay.sample(buffer, key, self.config.batch_size // self.num_devices)
         return batch if self.symmetries is None else mirrored(self.symmetries, batch, key_mirror)
 
-    def _watch(self, state: TrainState) -> InputStatistics:
-        """Takes the present observations of all devices into account, as long as it should."""
-        obs = array(state.env_state.obs)
-        mean = jax.lax.pmean(obs.mean(axis=0), AXIS)
-        away = obs - mean
-        covariance = jax.lax.pmean(away.T @ away / len(obs), AXIS)
-        seen = whitening.update(state.inputs, mean, covariance)
-        going_on = state.env_steps < self.config.whiten_steps
-        return jax.tree.map(lambda new, old: jnp.where(going_on, new, old), seen, state.inputs)
-
-    def _whitener(self, inputs: InputStatistics) -> tuple[jax.Array, jax.Array] | None:
-        if not self.config.whiten_steps:
-            return None
-        return inputs.mean, whitening.matrix(inputs, self.config.whiten_floor)
-
-    def _q_values(self, whiten: tuple[jax.Array, jax.Array] | None) -> QValues:
-        def q_values(params: Params, obs: jax.Array) -> jax.Array:
-            if whiten is not None:  # the small kernel instead of every observation
-                params = self.network.folded(params, *whiten)
-            values = self.network.apply(params, obs)
-            assert isinstance(values, jax.Array)
-            return values
-
-        return q_values
+    def _q_values(self, params: Params, obs: jax.Array) -> jax.Array:
+        values = self.network.apply(params, obs)
+        assert isinstance(values, jax.Array)
+        return values

@@ -57,19 +57,30 @@ def init(example: Transition, capacity: int, batch: int) -> ReplayState:
     return ReplayState(data, jnp.int32(0), jnp.int32(0))
 
 
-def add(state: ReplayState, batch: Transition) -> ReplayState:
-    """Overwrites the oldest rows with a batch, (batch, ...) per field."""
+def add(state: ReplayState, batch: Transition, wanted: jax.Array | bool = True) -> ReplayState:
+    """Overwrites the oldest rows with a batch.
+
+    Args:
+      state: the buffer.
+      batch: (batch, ...) per field.
+      wanted: () if false, the buffer stays as it is.
+    """
     capacity = state.data.action.shape[0]
     rows = batch.action.shape[0]
     if capacity % rows:
         raise ValueError(f"batch of {rows} rows does not divide the capacity, {capacity}")
-    data = jax.tree.map(
-        lambda ring, new: jax.lax.dynamic_update_slice_in_dim(ring, new, state.position, 0),
-        state.data,
-        batch,
-    )
+
+    def write(ring: jax.Array, new: jax.Array) -> jax.Array:
+        old = jax.lax.dynamic_slice_in_dim(ring, state.position, rows, 0)
+        new = jnp.where(wanted, new, old)
+        return jax.lax.dynamic_update_slice_in_dim(ring, new, state.position, 0)
+
     position = (state.position + rows) % capacity
-    return ReplayState(data, position, jnp.minimum(state.size + rows, capacity))
+    return ReplayState(
+        jax.tree.map(write, state.data, batch),
+        jnp.where(wanted, position, state.position),
+        jnp.where(wanted, jnp.minimum(state.size + rows, capacity), state.size),
+    )
 
 
 def sample(state: ReplayState, key: jax.Array, batch_size: int) -> Transition:

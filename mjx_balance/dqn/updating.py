@@ -1,4 +1,7 @@
-"""One gradient step: reflections, loss, clipped Adam, target network."""
+"""One gradient step: reflections, loss, clipped Adam, target network.
+
+A step whose loss or gradient is not a finite number is not made.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias
@@ -10,6 +13,7 @@ import optax
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn.devices import AXIS
 from mjx_balance.dqn.losses import td_error
+from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.replay import Transition
 
 Params: TypeAlias = Any
@@ -22,7 +26,9 @@ class LearnerState(NamedTuple):
     """The part of the training state that an update changes."""
 
     params: Params
+    """Of a network that takes whitened observations."""
     target_params: Params
+    """Of one that takes raw ones: a copy keeps the whitening of its time."""
     opt_state: optax.OptState
     gradient_steps: jax.Array
 
@@ -69,11 +75,7 @@ def mirrored(symmetries: Symmetries, batch: Transition, key: jax.Array) -> Trans
 
 
 def loss(
-    params: Params,
-    target_params: Params,
-    batch: Transition,
-    q_values: QValues,
-    config: DQNConfig,
+    params: Params, target_params: Params, batch: Transition, q_values: QValues, config: DQNConfig
 ) -> jax.Array:
     """Mean squared TD error () of a batch (paper Eq. 1), or of Double DQN."""
     q_tm1 = q_values(params, batch.obs)
@@ -90,28 +92,38 @@ def update(
     state: LearnerState,
     batch: Transition,
     q_values: QValues,
+    fold: Callable[[Params], Params],
     optimizer: optax.GradientTransformation,
     config: DQNConfig,
-) -> tuple[LearnerState, jax.Array]:
+) -> tuple[LearnerState, Mean]:
     """One gradient step on a batch of which each device has its share.
 
     Args:
       state: the same on every device, before and after.
       batch: (share, ...) per field.
       q_values: what the network makes of parameters and observations.
+      fold: puts the whitening of inputs, as it is now, into parameters.
       optimizer: from `make_optimizer`.
       config: the algorithm.
 
     Returns:
-      The state, and the loss () over all devices.
+      The state, and the loss over all devices: a mean of one, of none if the step was not made.
     """
-    loss_and_grads = jax.value_and_grad(loss)
-    value, grads = loss_and_grads(state.params, state.target_params, batch, q_values, config)
-    value, grads = jax.lax.pmean((value, grads), AXIS)
+
+    def whitened_loss(params: Params) -> jax.Array:
+        return loss(fold(params), state.target_params, batch, q_values, config)
+
+    value: jax.Array
+    value, grads = jax.lax.pmean(jax.value_and_grad(whitened_loss)(state.params), AXIS)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
     gradient_steps = state.gradient_steps + 1
-    target_params = optax.periodic_update(
-        params, state.target_params, gradient_steps, config.target_update_period
+    target_params = jax.lax.cond(
+        gradient_steps % config.target_update_period == 0,
+        lambda: fold(params),
+        lambda: state.target_params,
     )
-    return LearnerState(params, target_params, opt_state, gradient_steps), value
+    sound = jnp.isfinite(value) & jnp.isfinite(optax.global_norm(grads))
+    made = LearnerState(params, target_params, opt_state, gradient_steps)
+    kept = jax.tree.map(lambda new, old: jnp.where(sound, new, old), made, state)
+    return kept, Mean(jnp.where(sound, value, 0.0), sound.astype(jnp.float32))

@@ -36,11 +36,11 @@ class Reference:
 
     def __post_init__(self) -> None:
         size = len(self.params["hidden_0"]["kernel"])
-        self.target = copied(self.params)
         self.first = {layer: zeros(value) for layer, value in self.params.items()}
         self.second = copied(self.first)
         self.steps = 0
         self.mean, self.covariance, self.batches = np.zeros(size), np.eye(size), 0
+        self.synchronise()
 
     def observe(self, obs: np.ndarray, env_steps: int) -> None:
         """Takes observations (n, obs_size) into the statistics, as long as it should."""
@@ -57,13 +57,18 @@ class Reference:
         self.mean = self.mean + weight * away
         self.batches += 1
 
-    def white(self, obs: np.ndarray) -> np.ndarray:
+    def synchronise(self) -> None:
+        """The target is a copy of the network as it is now, its whitening included."""
+        self.target, self.target_moments = copied(self.params), (self.mean, self.covariance)
+
+    def white(self, obs: np.ndarray, moments: Any = None) -> np.ndarray:
         """Observations as the network takes them."""
         if not self.config.whiten_steps:
             return obs
-        values, vectors = np.linalg.eigh(self.covariance)
+        mean, covariance = moments or (self.mean, self.covariance)
+        values, vectors = np.linalg.eigh(covariance)
         scale = np.diag((values + self.config.whiten_floor) ** -0.5)
-        return (obs - self.mean) @ vectors @ scale @ vectors.T
+        return (obs - mean) @ vectors @ scale @ vectors.T
 
     def choose(self, obs: np.ndarray) -> np.ndarray:
         """Greedy actions (n,) for observations (n, obs_size)."""
@@ -73,7 +78,7 @@ class Reference:
         """One gradient step on rows (n, ...) of which each counts the same; returns the loss."""
         config, count = self.config, len(rows.action)
         each = np.arange(count)
-        q_t = values(self.target, self.white(rows.next_obs))
+        q_t = values(self.target, self.white(rows.next_obs, self.target_moments))
         chooser = values(self.params, self.white(rows.next_obs)) if config.double else q_t
         best = q_t[each, chooser.argmax(axis=1)]
         wanted = rows.reward + config.gamma * np.where(rows.terminated, 0.0, best)
@@ -84,7 +89,7 @@ class Reference:
         self.descend(gradient(self.params, obs, by_output))
         self.steps += 1
         if self.steps % config.target_update_period == 0:
-            self.target = copied(self.params)
+            self.synchronise()
         return float(np.mean(error**2))
 
     def descend(self, grads: Layers) -> None:

@@ -1,7 +1,6 @@
 """The DQN on environments with known values, on two devices."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,7 +16,6 @@ from mjx_balance.dqn import replay
 from mjx_balance.dqn.devices import AXIS
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.dqn.networks import QNetwork
-from mjx_balance.training import checkpoints
 
 CONFIG = DQNConfig(
     gamma=0.5,
@@ -102,20 +100,25 @@ def test_bootstraps_from_the_target_network_alone(double: bool) -> None:
     np.testing.assert_allclose(values(learner, state, 1.0), (wanted, wanted), atol=0.1)
 
 
-def test_each_device_samples_its_share_of_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+def test_each_device_draws_its_own_share_of_every_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """32 rows per update are 16 of each device, and no device or update repeats another's."""
+    drawn = []
     sample = replay.sample
 
     def spy(state: Any, key: jax.Array, batch_size: int) -> Any:
-        asked.append(batch_size)
-        return sample(state, key, batch_size)
+        jax.debug.callback(lambda rows: drawn.append(tuple(rows.tolist())), key)
+        batch = sample(state, key, batch_size)
+        assert len(batch.action) == 16
+        return batch
 
     monkeypatch.setattr(replay, "sample", spy)
-    for count in (1, 2):
-        learner = make(probes.OneStep(), devices=jax.devices()[:count])
-        state = jax.eval_shape(lambda learner=learner: learner.init(0))
-        jax.eval_shape(learner.train_program(1), state)
-    assert set(asked) == {32, 16}
+    learner = make(probes.OneStep())
+    state, _ = learner.train_program(4)(learner.init(0))
+    jax.block_until_ready(state)
+    jax.effects_barrier()
+    updates = int(state.gradient_steps)
+    assert updates > 0
+    assert len(drawn) == len(set(drawn)) == 2 * updates
 
 
 def test_every_env_device_and_update_draws_by_itself() -> None:
@@ -146,7 +149,7 @@ def test_no_key_is_used_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     signatures = key_reuse.key_reuse_signatures
     fold_in = next(primitive for primitive in signatures if primitive.name == "random_fold_in")
     monkeypatch.setitem(signatures, fold_in, once)
-    check(learner.iteration, state)
+    check(lambda state: learner.iteration(state, jnp.bool(True)), state)
 
 
 def test_traced_once_for_many_calls(noisy: tuple[Learner, Any, Any]) -> None:
@@ -192,13 +195,22 @@ def test_mirror_teaches_what_was_never_seen() -> None:
 
 
 def test_no_update_before_the_replay_is_warm() -> None:
-    """5 decisions of 8 envs are wanted: the fifth iteration is the first that learns."""
+    """5 decisions of 8 envs are wanted: the fifth iteration is the first that learns.
+
+    The loss is a mean over updates that were made, not over those that were not.
+    """
     learner = make(probes.OneStep(), min_replay_size=5 * ENVS)
     program = learner.train_program(1)
     state = learner.init(0)
+    losses = []
     for k in range(1, 8):
-        state, _ = program(state)
+        state, metrics = program(state)
+        losses.append(float(metrics["loss"]))
         assert int(state.gradient_steps) == max(k - 4, 0) * CONFIG.updates_per_step(ENVS)
+        assert np.isnan(losses[-1]) == (k < 5)
+    _, metrics = learner.train_program(7)(learner.init(0))
+    assert metrics["loss"] == pytest.approx(np.mean(losses[4:]), rel=1e-4)
+    assert metrics["reward"] == 1
 
 
 def test_learning_begins_even_if_the_replay_is_rounded_below_its_minimum() -> None:
@@ -207,19 +219,15 @@ def test_learning_begins_even_if_the_replay_is_rounded_below_its_minimum() -> No
     assert int(state.gradient_steps) > 0
 
 
-def test_a_restored_run_equals_an_uninterrupted_one(
-    tmp_path: Path, noisy: tuple[Learner, Any, Any]
-) -> None:
-    learner, program, state = noisy
-    state = jax.tree.map(jnp.copy, state)
-    checkpoints.save(tmp_path, int(state.env_steps), state)
-    uninterrupted, _ = program(state)
-    resumed, _ = program(checkpoints.restore(tmp_path, learner.init(7), pytest.fail))
-    jax.tree.map(
-        lambda a, b: np.testing.assert_array_equal(jax.device_get(a), jax.device_get(b)),
-        resumed,
-        uninterrupted,
-    )
+def test_the_state_is_everything(noisy: tuple[Learner, Any, Any]) -> None:
+    """Copied to the host and back, with another learner, a run goes on as if nothing was."""
+    _, program, state = noisy
+    host = jax.device_get(state)
+    uninterrupted, _ = program(jax.tree.map(jnp.copy, state))
+    learner = make(probes.NoisyState())
+    placed = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), host, learner.init(7))
+    resumed, _ = learner.train_program(10)(placed)
+    jax.tree.map(np.testing.assert_array_equal, *jax.device_get((resumed, uninterrupted)))
 
 
 @pytest.mark.parametrize(
@@ -240,3 +248,76 @@ class Several(probes.OneStep):
 def test_an_env_that_observes_a_dictionary_is_refused() -> None:
     with pytest.raises(TypeError, match="the env observes dict; this learner takes arrays"):
         make(Several()).init(0)
+
+
+@pytest.mark.parametrize("num_seeds", [1, 3])
+def test_the_whitening_matrix_is_computed_only_while_it_changes(num_seeds: int) -> None:
+    """Its eigenvalues stand in a branch that a finished gathering does not take."""
+    learner = make(probes.NoisyState(), num_seeds=num_seeds, whiten_steps=800)
+    state = jax.eval_shape(lambda: learner.init(0))
+    program = jax.make_jaxpr(learner.train_program(2))(state)
+    assert "eigh" in str(program)
+    assert not outside_of_conditions(program.jaxpr, "eigh")
+
+
+def outside_of_conditions(program: Any, primitive: str) -> bool:
+    """Whether a primitive occurs where it runs every time."""
+    for equation in program.eqns:
+        if equation.primitive.name == primitive:
+            return True
+        if equation.primitive.name != "cond":
+            inner = [getattr(x, "jaxpr", x) for x in equation.params.values()]
+            if any(outside_of_conditions(x, primitive) for x in inner if hasattr(x, "eqns")):
+                return True
+    return False
+
+
+def test_a_mirror_needs_symmetries() -> None:
+    config = dataclasses.replace(CONFIG, mirror=True)
+    with pytest.raises(ValueError, match="mirror is True, but no symmetries are given"):
+        Learner(probes.PositiveState(), QNetwork((4,), (2,)), config, ENVS, ENVS)
+
+
+def test_symmetries_are_used_only_where_the_config_says_so() -> None:
+    symmetries = probes.PositiveState.symmetries
+    learner = Learner(
+        probes.PositiveState(), QNetwork((4,), (2,)), CONFIG, ENVS, ENVS, symmetries=symmetries
+    )
+    assert learner.symmetries is None
+
+
+class Wide(probes.Walk):
+    """35 actions."""
+
+    @property
+    def action_size(self) -> int:
+        return 35
+
+
+def test_first_reset_begins_a_run_and_noise_follows_the_action_factors() -> None:
+    """Greedy actions are equal for equal observations; noise turns them to neighbours in (7, 5)."""
+
+    def late(key: jax.Array) -> Any:
+        state = probes.Walk().reset(key)
+        return state.replace(obs=jnp.asarray((5.0, 1.0)))
+
+    config = dataclasses.replace(CONFIG, exploration_noise=1, epsilon_start=0.0, epsilon_end=0.0)
+    network = QNetwork((4,), (35,))
+    learner = Learner(Wide(), network, config, 256, 2_560, action_factors=(7, 5), first_reset=late)
+    start = learner.init(0)
+    np.testing.assert_array_equal(start.env_state.obs, np.tile((5.0, 1.0), (256, 1)))
+    best = int(np.argmax(np.asarray(network.apply(start.params, jnp.asarray((5.0, 1.0))))))
+    program = learner.train_program(1)
+    state, _ = program(start)
+    actions = np.asarray(state.replay.data.action)[:128]
+    x, y = np.divmod(best, 5)
+    expected = {
+        5 * i + j
+        for i in range(max(x - 1, 0), min(x + 2, 7))
+        for j in range(max(y - 1, 0), min(y + 2, 5))
+    }
+    assert set(actions.tolist()) == expected
+    state, _ = program(state)  # the third step of a walk: a usual reset follows
+    obs = np.asarray(state.env_state.obs)
+    assert (obs[:, 0] < 1).all()
+    np.testing.assert_array_equal(obs[:, 1], 0)

@@ -45,7 +45,7 @@ def test_parameters_are_those_of_a_second_implementation(case: str, devices: int
         QNetwork(config.hidden_sizes, (2,)),
         config,
         devices,
-        ITERATIONS * devices,
+        ITERATIONS * devices - devices // 2,  # the last iteration counts whole
         jax.devices()[:devices],
     )
     program = learner.train_program(1)

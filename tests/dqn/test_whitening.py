@@ -8,12 +8,14 @@ import pytest
 from mjx_balance.dqn import whitening
 from mjx_balance.dqn.networks import QNetwork
 
+FLOOR = 1e-6
+
 
 def gathered(batches: list[np.ndarray]) -> whitening.InputStatistics:
-    seen = whitening.init(batches[0].shape[1])
+    seen = whitening.init(batches[0].shape[1], FLOOR)
     for batch in batches:
         mean = jnp.asarray(batch.mean(axis=0))
-        seen = whitening.update(seen, mean, jnp.asarray(np.cov(batch.T, bias=True)))
+        seen = whitening.update(seen, mean, jnp.asarray(np.cov(batch.T, bias=True)), FLOOR)
     return seen
 
 
@@ -46,15 +48,14 @@ def test_matrix_is_the_inverse_root_of_covariance_and_floor() -> None:
     """By hand: variances 3 and 0 with floor 1 become 1/2 and 1, in any rotated frame."""
     turn = np.asarray([[0.8, -0.6], [0.6, 0.8]])
     covariance = turn @ np.diag([3.0, 0.0]) @ turn.T
-    seen = whitening.InputStatistics(jnp.zeros(2), jnp.asarray(covariance), jnp.float32(1))
     expected = turn @ np.diag([0.5, 1.0]) @ turn.T
-    np.testing.assert_allclose(whitening.matrix(seen, 1.0), expected, atol=1e-6)
+    got = whitening.matrix(jnp.asarray(covariance, jnp.float32), 1.0)
+    np.testing.assert_allclose(got, expected, atol=1e-6)
 
 
 def test_a_variance_rounded_below_zero_counts_as_none() -> None:
     covariance = jnp.asarray([[1.0, 0.0], [0.0, -1e-3]])
-    seen = whitening.InputStatistics(jnp.zeros(2), covariance, jnp.float32(1))
-    np.testing.assert_allclose(whitening.matrix(seen, 1e-4)[1, 1], 100, rtol=1e-4)
+    np.testing.assert_allclose(whitening.matrix(covariance, 1e-4)[1, 1], 100, rtol=1e-4)
 
 
 def test_whitened_observations_are_uncorrelated_and_of_equal_size() -> None:
@@ -63,7 +64,7 @@ def test_whitened_observations_are_uncorrelated_and_of_equal_size() -> None:
     common = rng.normal(size=(4_000, 1))
     obs = 5 + common + 0.1 * rng.normal(size=(4_000, 3))
     seen = gathered(np.split(obs, 40))
-    white = (obs - np.asarray(seen.mean)) @ np.asarray(whitening.matrix(seen, 1e-6))
+    white = (obs - np.asarray(seen.mean)) @ np.asarray(seen.matrix)
     np.testing.assert_allclose(np.cov(white.T), np.eye(3), atol=0.15)
 
 
@@ -82,3 +83,9 @@ def test_folded_parameters_take_raw_observations(radial: bool, hidden: tuple[int
     np.testing.assert_allclose(
         np.asarray(network.apply(folded, obs)), np.asarray(expected), rtol=2e-4, atol=2e-4
     )
+
+
+def test_before_any_observation_inputs_are_only_shrunk_by_the_floor() -> None:
+    seen = whitening.init(3, 3.0)
+    np.testing.assert_allclose(seen.matrix, np.eye(3) / 2, atol=1e-6)
+    np.testing.assert_array_equal(seen.mean, 0)

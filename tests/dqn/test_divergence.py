@@ -1,0 +1,196 @@
+"""NaN and infinity, from wherever they come, stop neither the training nor what it learns."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from brax.envs.base import Env
+
+from mjx_balance.config import DQNConfig
+from mjx_balance.dqn import replay
+from mjx_balance.dqn.collecting import collect
+from mjx_balance.dqn.devices import AXIS
+from mjx_balance.dqn.learner import Learner
+from mjx_balance.dqn.networks import QNetwork
+
+CONFIG = DQNConfig(
+    gamma=0.5,
+    learning_rate=3e-3,
+    learning_rate_end_share=0.1,
+    batch_size=32,
+    replay_ratio=8,
+    replay_capacity=512,
+    min_replay_size=16,
+    target_update_period=20,
+    epsilon_decay_steps=1_000,
+    epsilon_end=0.3,
+    hidden_sizes=(16,),
+    whiten_steps=1_600,
+)
+ENVS, ITERATIONS = 8, 500
+
+
+def make(env: Env, num_seeds: int = 1, **changes: Any) -> Learner:
+    config = dataclasses.replace(CONFIG, **changes)
+    network = QNetwork(config.hidden_sizes, (2,))
+    return Learner(env, network, config, ENVS, ENVS * ITERATIONS, num_seeds=num_seeds)
+
+
+def assert_finite(tree: Any) -> None:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(jax.device_get(tree)):
+        assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
+
+
+def learnt(state: Any) -> Any:
+    """All that must stay finite, and is kept from step to step."""
+    return state.params, state.target_params, state.opt_state, state.inputs, state.replay
+
+
+def assert_learnt(learner: Learner, state: Any) -> None:
+    """Actions of a step are worth -x and x, whatever happens to other steps."""
+    assert_finite(learnt(state))
+    raw = learner.exported(state)
+    for x in (-0.7, 0.6):
+        q_values = learner.network.apply(raw, jnp.asarray((x, 1.0)))
+        np.testing.assert_allclose(np.asarray(q_values), (-x, x), atol=0.15)
+
+
+def test_training_ends_in_good_values() -> None:
+    faults = {"obs": math.nan, "reward": math.inf, "done": math.nan, "reset": -math.inf}
+    learner = make(probes.Faulty(faults, 0.03))
+    state, metrics = learner.train_program(ITERATIONS)(learner.init(0))
+    assert_learnt(learner, state)
+    assert metrics["diverged"] == pytest.approx(1 - 0.97**4, abs=0.02)
+    assert metrics["skipped_updates"] == 0
+    assert metrics["mine"] == 1
+    assert abs(float(metrics["reward"])) < 1
+
+
+def test_observations_whose_squares_are_beyond_numbers_spoil_no_statistics() -> None:
+    learner = make(probes.Faulty({"reset": 1e30}, 0.02))
+    state, metrics = learner.train_program(ITERATIONS)(learner.init(0))
+    assert_learnt(learner, state)
+    assert metrics["diverged"] == 0
+    assert 50 < float(state.inputs.batches) < 195, "of 200 batches, those without such a number"
+
+
+def test_rewards_too_great_to_be_squared_cost_the_updates_that_meet_them() -> None:
+    """One row in 200 is one batch in seven: it is skipped, and counted, and the rest learns."""
+    learner = make(probes.Faulty({"reward": 1e30}, 0.005), whiten_steps=0)
+    state, metrics = learner.train_program(ITERATIONS)(learner.init(0))
+    assert_learnt(learner, state)
+    skipped = float(metrics["skipped_updates"])
+    assert 0.05 < skipped < 0.4
+    # 16 rows of each device are wanted in all, 8 of each: the second iteration is the first.
+    asked = 2 * (ITERATIONS - 1)
+    assert int(state.gradient_steps) == asked - round(skipped * 2 * ITERATIONS)
+
+
+def test_one_seed_of_several_leaves_the_others_alone() -> None:
+    """The parameters of the second are not numbers: the first never knows."""
+    learner = make(probes.NoisyState(), num_seeds=2)
+    program = learner.train_program(20)
+    sound, _ = program(learner.init(0))
+    state = learner.init(0)
+    spoilt = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.params)
+    state, metrics = program(state._replace(params=spoilt))
+    for a, b in zip(
+        *(jax.tree.leaves(jax.device_get(learnt(s))) for s in (state, sound)), strict=True
+    ):
+        np.testing.assert_array_equal(a[0], b[0])
+    np.testing.assert_array_equal(np.isnan(metrics["loss"]), (False, True))
+    np.testing.assert_array_equal(state.gradient_steps, (38, 0))
+    np.testing.assert_allclose(metrics["skipped_updates"], (0, 0.95), rtol=1e-6)
+    for leaf in jax.tree.leaves(jax.device_get(state.opt_state)):
+        np.testing.assert_array_equal(leaf[1], 0)
+
+
+def stepped(env: Env, obs: list[list[float]], action: list[int]) -> Any:
+    """What `collect` makes of envs at these observations, on each of two devices alike."""
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), len(obs)))
+    state = state.replace(obs=jnp.asarray(obs))
+
+    def one(key: jax.Array) -> Any:
+        return collect(env, state, jnp.asarray(action, jnp.int32), key)
+
+    keys = jnp.stack([jax.random.PRNGKey(1)] * 2)
+    return jax.device_get(jax.vmap(one, axis_name=AXIS)(keys))
+
+
+def test_a_diverged_env_is_reset_and_its_row_is_another_envs() -> None:
+    env = probes.Faulty({"reward": math.nan}, 1.0)
+    got = stepped(env, [[0.1, 1.0], [0.2, 0.0], [0.3, 1.0], [0.4, 0.0]], [0, 1, 1, 0])
+    assert got.storable.all()
+    np.testing.assert_allclose(got.transition.obs[0, :, 0], (0.2, 0.2, 0.2, 0.4))
+    np.testing.assert_array_equal(got.transition.action[0], (1, 1, 1, 0))
+    np.testing.assert_allclose(got.transition.reward[0], (0.2, 0.2, 0.2, -0.4))
+    assert got.metrics["diverged"].value()[0] == 0.5
+    assert got.metrics["reward"].value()[0] == pytest.approx(-0.1)
+    assert got.metrics["mine"].number[0] == 4, "two of each device"
+
+
+def test_where_no_row_is_finite_none_is_stored() -> None:
+    env = probes.Faulty({"obs": math.inf}, 1.0)
+    got = stepped(env, [[0.1, 1.0], [0.2, 1.0]], [0, 1])
+    assert not got.storable.any()
+    assert got.metrics["diverged"].value()[0] == 1
+    assert got.metrics["reward"].number[0] == 0
+
+
+def test_a_diverged_env_that_was_not_done_is_reset_all_the_same() -> None:
+    class Endless(probes.Faulty):
+        def step(self, state: Any, action: jax.Array) -> Any:
+            return super().step(state, action).replace(done=jnp.float32(0.0))
+
+    got = stepped(Endless({"reward": math.nan}, 1.0), [[0.1, 1.0], [0.2, 0.0]], [1, 1])
+    diverged, other = got.env_state.obs[0]
+    np.testing.assert_array_equal(other, (0.0, 0.0))  # where its step led
+    assert diverged[0] != 0
+    assert diverged[1] == 1
+
+
+def test_what_the_env_reports_as_diverged_is_counted_with_what_is_found() -> None:
+    class Honest(probes.Faulty):
+        def reset(self, rng: jax.Array) -> Any:
+            state = super().reset(rng)
+            return state.replace(metrics=state.metrics | {"diverged": jnp.float32(0.0)})
+
+        def step(self, state: Any, action: jax.Array) -> Any:
+            after = super().step(state, action)
+            own = (action == 1).astype(jnp.float32)
+            return after.replace(metrics=after.metrics | {"diverged": own})
+
+    got = stepped(
+        Honest({"reward": math.nan}, 1.0),
+        [[0.1, 1.0], [0.1, 1.0], [0.1, 0.0], [0.1, 0.0], [0.1, 0.0]],
+        [0, 1, 0, 0, 1],
+    )
+    assert got.metrics["diverged"].value()[0] == pytest.approx(3 / 5)
+
+
+def test_all_envs_diverging_at_once_is_no_end() -> None:
+    """Nothing is ever stored, nothing learnt, and nothing breaks."""
+    learner = make(probes.Faulty({"reward": math.nan}, 1.0))
+    start = jax.device_get(learner.init(0))
+    state, metrics = learner.train_program(3)(learner.init(0))
+    assert int(state.replay.size) == int(state.replay.position) == 0
+    assert int(state.env_steps) == 3 * ENVS
+    jax.tree.map(np.testing.assert_array_equal, start.params, jax.device_get(state.params))
+    assert metrics["diverged"] == 1
+    assert np.isnan(metrics["loss"])
+
+
+def test_a_batch_that_is_not_wanted_changes_nothing() -> None:
+    example = replay.Transition(*map(jnp.asarray, ([0.0], 0, 0.0, 0.0, [0.0])))
+    state = replay.init(example, 6, 2)
+    for k in range(8):
+        rows = jax.tree.map(lambda x, k=k: jnp.stack((x + k, x + k)), example)
+        after = replay.add(state, rows, jnp.bool_(False))
+        jax.tree.map(np.testing.assert_array_equal, state, after)
+        state = replay.add(state, rows, jnp.bool_(True))
+    assert sorted(np.asarray(state.data.action).tolist()) == [5, 5, 6, 6, 7, 7]
