@@ -11,7 +11,6 @@ import argparse
 import hashlib
 import json
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -70,17 +69,16 @@ def result_of(
     """The evaluation of one run, trained if it is wanted and missing."""
     common = (
         f"--preset {name} --num-env-steps {DECISIONS[name]} --seed {seed} "
-        f"--eval-scenarios {SCENARIOS[name]} --checkpoint-every {DECISIONS[name]}"
+        f"--eval-scenarios {SCENARIOS[name]}"
     )
     digest = hashlib.sha256(f"{common} {flags}".encode()).hexdigest()[:8]
     slug = "-".join(re.findall("[a-z0-9.]+", title.lower()))
     folder = runs / f"{name}-{slug}-seed{seed}-{digest}"
     result = folder / "evaluation.json"
     if wanted and not result.is_file():
-        if any(folder.glob("checkpoints/*")):  # it has the flags in its folder
+        if folder.is_dir():  # it has the flags in its folder
             more = ["--resume", str(folder)]
         else:
-            shutil.rmtree(folder, ignore_errors=True)
             more = ["--run-dir", str(folder), *common.split(), *flags.split()]
         subprocess.run([sys.executable, "-m", "mjx_balance", "train", *more], check=True)
     return json.loads(result.read_text()) if result.is_file() else None

@@ -39,7 +39,7 @@ def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
     from mjx_balance.config import preset
 
     config = dataclasses.replace(preset(preset_name), num_envs=num_envs)
-    devices.configure_jax()
+    devices.configure_jax(print)
     jax.config.update("jax_enable_compilation_cache", False)  # to time the compilation
     config = devices.size_to_device(config)
     env = BalanceEnv(config)

@@ -16,6 +16,7 @@ from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.run_folder import RunFolderError, read_run_config
 
+FAILED = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
 COMMANDS = ("train", "evaluate", "report")
@@ -95,16 +96,22 @@ def _train(argv: list[str]) -> int:
         return _complain("--resume continues a folder in place; leave --run-dir out")
 
     with quiet_imports():
-        from mjx_balance import training
+        from mjx_balance.training import run
     from mjx_balance.display import Display
     from mjx_balance.training.checkpoints import CheckpointError
 
     display = Display()
     try:
-        training.train(parsed.config, parsed.run_dir, parsed.resume, display)
+        run.train(parsed.config, parsed.run_dir, parsed.resume, display)
     except (ConfigError, RunFolderError, CheckpointError) as error:
         return _complain(str(error))
-    except training.Interrupted as stopped:
+    except PolicyError as error:
+        _complain(str(error))
+        return FAILED
+    except OSError as error:  # a full disk: what is saved stays, and can be resumed
+        _complain(f"cannot write {error.filename or 'the run'}: {error.strerror}")
+        return FAILED
+    except run.Interrupted as stopped:
         display.say(str(stopped))
         return INTERRUPTED
     except KeyboardInterrupt:

@@ -230,8 +230,8 @@ class Config:
     """JAX devices to spread the boards over; none: one per CPU core, or all accelerators."""
     log_every: int = bounded(2_048, least=1)
     """Env steps between two lines of metrics."""
-    checkpoint_every: int = bounded(100_000, least=1)
-    """Env steps between two checkpoints."""
+    checkpoint_seconds: float = bounded(45.0, above=0)
+    """Time between two checkpoints, s."""
     eval_scenarios: int = bounded(128, least=1)
     """Scenarios per suite of the evaluation after training."""
     eval_duration: float = bounded(60.0, above=0)

@@ -30,6 +30,11 @@ SHOWN = {
     "train/loss": ("loss", "{:.5f}"),
     "train/epsilon": ("epsilon", "{:.3f}"),
 }
+WARNED = {
+    "train/diverged": ("diverged envs", "{:,.0f}"),
+    "train/skipped_updates": ("skipped updates", "{:.1%}"),
+}
+"""Shown only where there are any."""
 
 
 class Display:
@@ -118,12 +123,20 @@ class Display:
             yield Bar(None)
 
     def _line(self) -> str:
-        cells = (
+        cells = [
             f"{label} {text.format(self._metrics[name])}"
             for name, (label, text) in SHOWN.items()
             if name in self._metrics
-        )
-        return "  ".join(cells)
+        ]
+        return "  ".join([*cells, *self._warnings()])
+
+    def _warnings(self) -> list[str]:
+        """What should not be, where it is."""
+        return [
+            f"{label} {text.format(self._metrics[name])}"
+            for name, (label, text) in WARNED.items()
+            if self._metrics.get(name, 0) > 0
+        ]
 
     def _panel(self) -> Panel:
         grid = Table.grid(padding=(0, 3))
@@ -135,8 +148,11 @@ class Display:
             cells += [f"[dim]{label}[/dim]", f"[bold]{value}[/bold]"]
         grid.add_row(*cells[:6])
         grid.add_row(*cells[6:])
+        warnings = [f"[bold red]{warning}[/bold red]" for warning in self._warnings()]
         assert self._progress is not None
-        return Panel(Group(self._progress, grid), title="mjx_balance", border_style="cyan")
+        return Panel(
+            Group(self._progress, grid, *warnings), title="mjx_balance", border_style="cyan"
+        )
 
 
 class Bar:

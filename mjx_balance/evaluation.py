@@ -275,6 +275,32 @@ def evaluate(
     return summarize(rollout, suite, duration, seed)
 
 
+def check_fits(config: Config, scenarios: int, duration: float, recorded: int = 0) -> None:
+    """Refuses an evaluation of nothing, or of more than the memory takes.
+
+    Args:
+      config: the task.
+      scenarios: how many.
+      duration: of each, s.
+      recorded: numbers kept of every physics step besides the tilt.
+
+    Raises:
+      EvaluationError: with the estimate.
+    """
+    if scenarios < 1:
+        raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
+    if not (np.isfinite(duration) and duration > 0):
+        raise EvaluationError(f"duration is {duration}; it must be a number of seconds above 0")
+    steps = scenarios * duration / config.task.sim_dt
+    needed = 8 * steps * (TILT_COPIES + recorded)
+    available = psutil.virtual_memory().available
+    if needed > available:
+        raise EvaluationError(
+            f"scenarios is {scenarios} and duration {duration:g} s: that takes about "
+            f"{needed / 2**30:,.1f} GiB, and {available / 2**30:.1f} GiB are free; lower one"
+        )
+
+
 def run_suite(
     scene: Scene,
     config: Config,
@@ -292,18 +318,7 @@ def run_suite(
       EvaluationError: if there are no scenarios or no time, or too much for the memory.
       SuiteError: as `make_scenarios`.
     """
-    if scenarios < 1:
-        raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
-    if not (np.isfinite(duration) and duration > 0):
-        raise EvaluationError(f"duration is {duration}; it must be a number of seconds above 0")
-    steps = scenarios * duration / config.task.sim_dt
-    needed = 8 * steps * (TILT_COPIES + (scene.model.nq if record else 0))
-    available = psutil.virtual_memory().available
-    if needed > available:
-        raise EvaluationError(
-            f"scenarios is {scenarios} and duration {duration:g} s: that takes about "
-            f"{needed / 2**30:,.1f} GiB, and {available / 2**30:.1f} GiB are free; lower one"
-        )
+    check_fits(config, scenarios, duration, scene.model.nq if record else 0)
     drawn, conditions = make_scenarios(config, suite, scenarios, duration, seed)
     return roll_out(
         scene,

@@ -1,10 +1,30 @@
-"""The files of a run's folder: their names, and whether they make a run. No JAX."""
+"""The files of a run's folder: their names, and whether they make a run. No JAX.
 
+Whatever is written here is written whole or not at all, so that a run can be killed at any
+moment and go on.
+"""
+
+import contextlib
 import dataclasses
 import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from mjx_balance.config import Config, check, flatten, from_dict, to_dict
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+READ_AT_MOST = 2**20
+"""Bytes of a config or a provenance; a file with more is neither."""
+SAID_AT_MOST = 300
+"""Characters of another's error that a message repeats."""
 
 
 class RunFolderError(ValueError):
@@ -20,6 +40,16 @@ class RunFolder:
     @property
     def config(self) -> Path:
         return self.path / "config.json"
+
+    @property
+    def provenance(self) -> Path:
+        """What the run was started with besides its config: scene, engine, versions."""
+        return self.path / "provenance.json"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the process that works on the run."""
+        return self.path / ".lock"
 
     @property
     def metrics(self) -> Path:
@@ -43,6 +73,10 @@ class RunFolder:
         """Policy and evaluation of every seed, where there are several."""
         return self.path / "seeds"
 
+    def seed_policy(self, seed: int) -> Path:
+        """The policy of one of several seeds."""
+        return self.seeds / f"seed-{seed}.safetensors"
+
     @property
     def policy(self) -> Path:
         return self.path / "policy.safetensors"
@@ -61,8 +95,32 @@ class RunFolder:
         return self.path / "report.json"
 
 
-def create_run_folder(path: Path, config: Config) -> RunFolder:
-    """Makes a new run folder.
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Writes a file whole or not at all, whenever the process or the machine dies.
+
+    Raises:
+      OSError: if it cannot be written; what was there before is then still there.
+    """
+    part = path.with_name(f"{path.name}.part")
+    with part.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Writes values as a JSON file, as `write_atomically`."""
+    write_atomically(path, json.dumps(values, indent=2) + "\n")
+
+
+def create_run_folder(path: Path, config: Config, provenance: Mapping[str, Any]) -> RunFolder:
+    """Makes a new run folder: it has all it takes to resume from the moment it exists.
+
+    Args:
+      path: of the folder.
+      config: of the run.
+      provenance: what else decides it, in JSON values; see `check_same_provenance`.
 
     Raises:
       RunFolderError: if it exists or cannot be written; nothing is touched then.
@@ -72,19 +130,46 @@ def create_run_folder(path: Path, config: Config) -> RunFolder:
             f"run folder {path} exists; choose another with --run-dir, or continue it with "
             f"--resume {path}"
         )
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    shutil.rmtree(part, ignore_errors=True)  # of a dead process of that number
     try:
-        path.mkdir(parents=True)
-        folder = RunFolder(path)
-        folder.config.write_text(json.dumps(to_dict(config), indent=2) + "\n")
+        part.mkdir(parents=True)
+        write_json(RunFolder(part).config, to_dict(config))
+        write_json(RunFolder(part).provenance, provenance)
+        part.rename(path)
     except OSError as error:
+        shutil.rmtree(part, ignore_errors=True)
         raise RunFolderError(
             f"run folder {path} cannot be written: {error.strerror}; choose another with --run-dir"
         ) from error
-    return folder
+    return RunFolder(path)
+
+
+@contextlib.contextmanager
+def locked(folder: RunFolder) -> Iterator[None]:
+    """Keeps other processes out of a run; the lock goes when the process does, however it ends.
+
+    Raises:
+      RunFolderError: if another process works on the run.
+    """
+    with folder.lock.open("a+b") as file:
+        try:
+            if sys.platform == "win32":
+                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+            else:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError) as error:
+            raise RunFolderError(
+                f"another process works on the run in {folder.path}; wait for its end, or start "
+                "a new run with --run-dir"
+            ) from error
+        except OSError:
+            pass  # a file system that knows no locks
+        yield
 
 
 def read_run_config(path: Path) -> Config:
-    """Reads the config of an existing run.
+    """Reads the config of an existing run that is not finished.
 
     Raises:
       RunFolderError: if `path` is no run folder, or its run is finished.
@@ -95,9 +180,30 @@ def read_run_config(path: Path) -> Config:
     if folder.evaluation.is_file():
         raise RunFolderError(f"the run in {path} is finished; start a new one with --run-dir")
     try:
-        return check(from_dict(Config, json.loads(folder.config.read_text())))
-    except (ValueError, TypeError, OSError) as error:
-        raise RunFolderError(f"{folder.config} cannot be used: {error}") from error
+        return check(from_dict(Config, _read_json(folder.config)))
+    # A config of the wrong types can fail anywhere.
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise RunFolderError(f"{folder.config} cannot be used: {_brief(error)}") from error
+
+
+def _read_json(file: Path) -> Any:
+    """Reads a small JSON file; raises ValueError for whatever is wrong with it."""
+    try:
+        with file.open("rb") as opened:
+            content = opened.read(READ_AT_MOST + 1)
+        if len(content) > READ_AT_MOST:
+            raise ValueError(f"it is longer than {READ_AT_MOST} bytes")
+        return json.loads(content)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    except OSError as error:
+        raise ValueError(str(error.strerror)) from error
+
+
+def _brief(error: Exception) -> str:
+    """What an error says, in one line that is not too long."""
+    said = " ".join(str(error).split())
+    return said if len(said) <= SAID_AT_MOST else f"{said[:SAID_AT_MOST]} ..."
 
 
 def check_same_config(saved: Config, wanted: Config, path: Path) -> None:
@@ -113,3 +219,52 @@ def check_same_config(saved: Config, wanted: Config, path: Path) -> None:
                 f"{path} was started with {name} = {before[name]}, not {value}; resume it "
                 "without that flag, or start a new run"
             )
+
+
+def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
+    """Compares what a run was started with, besides its config, with what there is today.
+
+    Args:
+      path: of the run's folder.
+      today: `versions` (library -> version), and whatever else decides the run, by name.
+
+    Returns:
+      A sentence if only versions differ: the run may go on, though not to the same bits.
+
+    Raises:
+      RunFolderError: naming the first other thing that differs.
+    """
+    file = RunFolder(path).provenance
+    try:
+        saved = _read_json(file)
+        versions = dict(saved["versions"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise RunFolderError(
+            f"{file} cannot be used: {_brief(error)}; start a new run with --run-dir"
+        ) from error
+    for name, value in today.items():
+        if name != "versions" and saved.get(name) != value:
+            raise RunFolderError(
+                f"{path} was started with {name} {saved.get(name)}, but it is {value} today; go "
+                "back to that, or start a new run"
+            )
+    changed = [
+        f"{library} {versions.get(library)} (now {version})"
+        for library, version in today["versions"].items()
+        if versions.get(library) != version
+    ]
+    if not changed:
+        return None
+    return f"{path} was started with {', '.join(changed)}; it goes on, but not to the same bits"
+
+
+def keep_metrics_until(path: Path, env_steps: int) -> None:
+    """Drops lines that a resumed run will write again, and what a crash left half-written."""
+    if not path.is_file():
+        return
+    kept = []
+    for text in path.read_text(errors="replace").splitlines():
+        with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
+            if json.loads(text)["env_steps"] <= env_steps:
+                kept.append(f"{text}\n")
+    write_atomically(path, "".join(kept))

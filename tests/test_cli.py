@@ -1,20 +1,26 @@
 """Bad input: one sentence, exit code 2, nothing touched."""
 
+import dataclasses
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import videos
 
 from mjx_balance.cli import main
-from mjx_balance.config import preset, to_dict
+from mjx_balance.config import ConfigError, preset, to_dict
 from mjx_balance.controllers import make_controller
+from mjx_balance.env import BalanceEnv
 from mjx_balance.evaluation import observing, run_suite, summarize
-from mjx_balance.policy import load_policy
+from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.render import VIDEO_SIZE
+from mjx_balance.run_folder import RunFolderError, create_run_folder, locked
 from mjx_balance.scene import load_scene
+from mjx_balance.training import run
+from mjx_balance.training.checkpoints import CheckpointError
 
 SHIPPED = Path(__file__).parent.parent / "policies" / "best.safetensors"
 
@@ -55,6 +61,8 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (("--payload", "-1"), "payload is -1.0"),
         (("--preset", "paper", "--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
         (("--robot", "spot"), "robot is 'spot'; known robots: quadruped"),
+        (("--num-envs", "64", "--num-devices", "8"), "num_devices is 8"),
+        (("--eval-scenarios", "100000000"), "eval_scenarios is 100000000 and duration 60 s: that"),
         (("--learning-rate", "nan"), "learning_rate is nan"),
         (("--resume", "nowhere"), "nowhere is no run folder"),
     ],
@@ -84,18 +92,89 @@ def test_an_unwritable_run_folder_is_said(
     assert "run folder file/run cannot be written" in said
 
 
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (ConfigError("seed is x"), 2, "mjx-balance: seed is x"),
+        (RunFolderError("it is finished"), 2, "mjx-balance: it is finished"),
+        (CheckpointError("none is whole"), 2, "mjx-balance: none is whole"),
+        (PolicyError("no finite numbers"), 1, "mjx-balance: no finite numbers"),
+        (
+            OSError(28, "No space left on device", "runs/a"),
+            1,
+            "mjx-balance: cannot write runs/a: No space left on device",
+        ),
+        (run.Interrupted("go on with --resume x"), 130, "go on with --resume x"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_no_training_ends_in_a_traceback(
+    error: BaseException,
+    code: int,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def train(*given: object) -> None:
+        raise error
+
+    monkeypatch.setattr(run, "train", train)
+    assert main(["train", "--preset", "smoke"]) == code
+    shown = capsys.readouterr()
+    assert " ".join((shown.out + shown.err).split()) == said
+
+
+def test_flags_start_from_the_preset_or_from_the_resumed_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr(run, "train", lambda *arguments: given.append(arguments[:3]))
+    assert main(["train", "--preset", "smoke", "--gamma", "0.7", "--run-dir", "a"]) == 0
+    config, run_dir, resume = given[0]
+    assert (config.preset, config.num_envs, config.dqn.gamma) == ("smoke", 64, 0.7)
+    assert (run_dir, resume) == (Path("a"), None)
+    assert main(["train"]) == 0
+    assert given[1][0] == preset("default")
+    saved = dataclasses.replace(preset("best"), seed=9, num_env_steps=77)
+    create_run_folder(tmp_path / "run", saved, {})
+    assert main(["train", "--resume", "run"]) == 0
+    assert given[2] == (saved, None, Path("run"))
+    assert main(["train", "--resume", "run", "--run-dir", "b"]) == 2
+
+
 def test_resuming_with_another_config_is_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    run = tmp_path / "run"
-    run.mkdir()
-    values = to_dict(preset("smoke")) | {"num_devices": 1}
-    (run / "config.json").write_text(json.dumps(values))
+    folder = tmp_path / "run"
+    create_run_folder(folder, dataclasses.replace(preset("smoke"), num_devices=1), {})
     said = refuse(capsys, "train", "--resume", "run", "--gamma", "0.9")
     assert "run was started with gamma = 0.1, not 0.9" in said
     said = refuse(capsys, "train", "--resume", "run", "--preset", "paper")
     assert "run was started with preset = smoke, not paper" in said
-    assert os.listdir(run) == ["config.json"]
+    assert sorted(os.listdir(folder)) == ["config.json", "provenance.json"]
+
+
+def test_resuming_in_another_scene_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    provenance = {"scene_hash": "of another scene", "versions": {}}
+    create_run_folder(
+        tmp_path / "run", dataclasses.replace(preset("smoke"), num_devices=1), provenance
+    )
+    said = " ".join(refuse(capsys, "train", "--resume", "run").split())
+    assert "run was started with scene_hash of another scene, but it is" in said
+
+
+def test_resuming_a_run_at_work_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    config = dataclasses.replace(preset("smoke"), num_devices=1)
+    today = run.provenance(BalanceEnv(config))
+    folder = create_run_folder(tmp_path / "run", config, today)
+    with locked(folder):
+        said = " ".join(refuse(capsys, "train", "--resume", "run").split())
+    assert "another process works on the run in run;" in said
 
 
 def test_resuming_a_finished_run_is_refused(

@@ -264,7 +264,7 @@ BOUNDS: list[tuple[str, str, tuple[Any, ...], tuple[Any, ...]]] = [
     ("run", "num_env_steps", (1, 10**9), ABOVE_0),
     ("run", "num_devices", (None, 1, 8), ABOVE_0),
     ("run", "log_every", (1, 10**6), ABOVE_0),
-    ("run", "checkpoint_every", (1, 10**6), ABOVE_0),
+    ("run", "checkpoint_seconds", (0.1, 1e6), ABOVE_0),
     ("run", "solver_iterations", (1, 100), ABOVE_0),
     ("run", "line_search_iterations", (1, 100), ABOVE_0),
     ("run", "eval_scenarios", (1, 4096), ABOVE_0),

@@ -10,7 +10,7 @@ import mjx_balance
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
-    ("quiet", "robots.record"),
+    ("quiet", "sources", "robots.record"),
     ("robots.quadruped",),
     ("robots",),
     ("config",),
@@ -42,8 +42,8 @@ FLOORS = (
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
-    "robots config quiet task scene model_fields suites policy run_folder controllers evaluation "
-    "statistics render report display".split()
+    "robots config quiet sources task scene model_fields suites policy run_folder controllers "
+    "evaluation statistics render report display".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}

@@ -13,7 +13,7 @@ from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.env import BalanceEnv
 from mjx_balance.policy import action_factors
-from mjx_balance.training.program_cache import enable_compilation_cache
+from mjx_balance.training.program_cache import Say, enable_compilation_cache
 
 STATE_COPIES = 2
 """A checkpoint is read back beside the state that it replaces."""
@@ -23,12 +23,12 @@ CPU_ENVS = 256
 ACCELERATOR_ENVS = 2048
 
 
-def configure_jax() -> None:
+def configure_jax(say: Say) -> None:
     """Makes every CPU core a JAX device and turns the compilation cache on."""
     # Too late if JAX is already in use, as in a notebook: its devices do as they are.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-    enable_compilation_cache()
+    enable_compilation_cache(say)
 
 
 def size_to_device(config: Config) -> Config:

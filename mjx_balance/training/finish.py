@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 import time
 from typing import Any
 
@@ -10,20 +9,35 @@ import jax
 from tensorboardX import SummaryWriter
 
 from mjx_balance import evaluation
-from mjx_balance.config import Config
+from mjx_balance.config import Config, ConfigError
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
-from mjx_balance.policy import Policy, flat_weights, load_policy, make_manifest, save_policy
+from mjx_balance.policy import Policy, PolicyError, load_policy, make_manifest, save_policy
 from mjx_balance.report import figures, measuring, tables
-from mjx_balance.run_folder import RunFolder
+from mjx_balance.run_folder import RunFolder, write_atomically, write_json
 from mjx_balance.statistics import over_seeds
 from mjx_balance.suites import HEADLINE, SEEDS
 from mjx_balance.training.loop import number
+from mjx_balance.training.program_cache import Say
 
 VALIDATION_SCENARIOS = 32
+EVALUATION_EVENTS = ".evaluation"
+"""Ending of the TensorBoard file that has it."""
 
 Results = dict[str, dict[str, Any]]
 """Suite name -> JSON of `evaluation.summarize`."""
+
+
+def check_fits(config: Config) -> None:
+    """Refuses an evaluation that the memory would not take, before hours of training.
+
+    Raises:
+      ConfigError: with the estimate.
+    """
+    try:
+        evaluation.check_fits(config, config.eval_scenarios, config.eval_duration)
+    except evaluation.EvaluationError as error:
+        raise ConfigError(f"eval_{error}") from error
 
 
 def export(
@@ -33,54 +47,70 @@ def export(
     folder: RunFolder,
     state: TrainState,
     seconds: float,
+    say: Say,
 ) -> list[Policy]:
-    """Writes one policy per seed; the first also as the run's, until a better one is known."""
+    """Writes a policy per seed; the first also as the run's, until a better one is known.
+
+    Args:
+      config: of the run.
+      learner: exports the parameters.
+      scene_hash: fingerprint of the scene trained in.
+      folder: to write into.
+      state: of all seeds.
+      seconds: spent learning.
+      say: told of every seed whose weights are no policy; the others are not held up by it.
+
+    Raises:
+      PolicyError: if no seed has a policy.
+    """
     known = state._replace(env_state=None, replay=None)  # pyright: ignore[reportArgumentType]
-    policies = []
+    training = {
+        "env_steps": number(state.env_steps),
+        "gradient_steps": number(state.gradient_steps),
+        "seconds_learning_since_start_or_resume": round(seconds, 1),
+        "device": jax.devices()[0].device_kind,
+        "date": time.strftime("%Y-%m-%d"),
+    }
+    policies, files = [], []
     for k in range(config.num_seeds):
-        mine = jax.tree.map(lambda x: x[k], known) if config.num_seeds > 1 else known  # noqa: B023
-        mine = jax.device_get(learner.exported(mine))
-        provenance = {
-            "env_steps": number(state.env_steps),
-            "gradient_steps": number(state.gradient_steps),
-            "seconds_learning_since_start_or_resume": round(seconds, 1),
-            "device": jax.devices()[0].device_kind,
-            "date": time.strftime("%Y-%m-%d"),
-        }
         own = dataclasses.replace(config, seed=config.seed + k, num_seeds=1)
-        manifest = make_manifest(own, scene_hash, provenance)
-        if config.num_seeds > 1:
-            folder.seeds.mkdir(exist_ok=True)
-            save_policy(folder.seeds / f"seed-{own.seed}.safetensors", mine, manifest)
-        if k == 0:
-            save_policy(folder.policy, mine, manifest)
-        policies.append(Policy(manifest, flat_weights(mine)))
+        mine = jax.tree.map(lambda x: x[k], known) if config.num_seeds > 1 else known  # noqa: B023
+        weights = jax.device_get(learner.exported(mine))
+        manifest = make_manifest(own, scene_hash, training)
+        file = folder.policy if config.num_seeds == 1 else folder.seed_policy(own.seed)
+        try:
+            file.parent.mkdir(exist_ok=True)
+            policies.append(save_policy(file, weights, manifest))
+            files.append(file)
+        except PolicyError as error:
+            say(f"seed {own.seed} gives no policy: {error}")
+    if not policies:
+        raise PolicyError(
+            f"the run in {folder.path} learnt no policy of finite numbers; lower learning_rate"
+        )
+    if config.num_seeds > 1:
+        write_atomically(folder.policy, files[0].read_bytes())
     return policies
 
 
 def finish(
     config: Config, policies: list[Policy], folder: RunFolder, display: Display, began: float
 ) -> Results:
-    """Evaluates every seed, makes the best one the run's policy, draws and sums up."""
+    """Evaluates every seed, makes the best one the run's policy, draws and sums up.
+
+    What says that the run is finished, `evaluation.json`, is written last.
+    """
+    several = config.num_seeds > 1
     scenarios, duration = config.eval_scenarios, config.eval_duration
     each = [
-        {
-            suite: _evaluate(policy, suite, scenarios, duration, SEEDS.final, title, display)
-            for suite in HEADLINE
-        }
-        for policy in policies
-        for title in [f", seed {policy.config.seed}" if len(policies) > 1 else ""]
+        _evaluate(policy, scenarios, duration, SEEDS.final, several, display) for policy in policies
     ]
-    best = _choose(policies, each, duration, folder, display) if len(policies) > 1 else 0
+    best = _choose(policies, each, duration, folder, display) if several else 0
     results = each[best]
-    with SummaryWriter(str(folder.tensorboard)) as board:
-        for suite, result in results.items():
-            board.add_scalar(f"eval/{suite}/falls", result["falls"], config.num_env_steps)
-            for name, value in result["tilt_deg"].items():
-                board.add_scalar(f"eval/{suite}/tilt_{name}", value, config.num_env_steps)
+    _log(results, policies[best].manifest["training"]["env_steps"], folder)
     with display.phase("drawing figures"):
         _draw(folder)
-    folder.evaluation.write_text(json.dumps(results, indent=2) + "\n")
+    write_json(folder.evaluation, results)
     tables.print_summary(display.console, folder.path, results, time.perf_counter() - began)
     return results
 
@@ -94,17 +124,27 @@ def _draw(folder: RunFolder) -> None:
 
 
 def _evaluate(
-    policy: Policy,
-    suite: str,
-    scenarios: int,
-    duration: float,
-    seed: int,
-    whose: str,
-    display: Display,
-) -> dict[str, Any]:
+    policy: Policy, scenarios: int, duration: float, seed: int, several: bool, display: Display
+) -> Results:
+    """Evaluates a policy on every suite."""
     doing = "validating" if seed == SEEDS.validation else "evaluating in plain MuJoCo"
-    with display.bar(f"{doing}, suite {suite}{whose}") as bar:
-        return evaluation.evaluate(policy, suite, scenarios, duration, seed, bar)
+    whose = f", seed {policy.config.seed}" if several else ""
+    results = {}
+    for suite in HEADLINE:
+        with display.bar(f"{doing}, suite {suite}{whose}") as bar:
+            results[suite] = evaluation.evaluate(policy, suite, scenarios, duration, seed, bar)
+    return results
+
+
+def _log(results: Results, env_steps: int, folder: RunFolder) -> None:
+    """Gives TensorBoard the evaluation, once even if an earlier call was killed after that."""
+    for written in folder.tensorboard.glob(f"*{EVALUATION_EVENTS}"):
+        written.unlink()
+    with SummaryWriter(str(folder.tensorboard), filename_suffix=EVALUATION_EVENTS) as board:
+        for suite, result in results.items():
+            board.add_scalar(f"eval/{suite}/falls", result["falls"], env_steps)
+            for name, value in result["tilt_deg"].items():
+                board.add_scalar(f"eval/{suite}/tilt_{name}", value, env_steps)
 
 
 def _choose(
@@ -115,23 +155,20 @@ def _choose(
     display: Display,
 ) -> int:
     """Validates every seed, makes the best one the run's policy, writes seeds.json."""
-    scores, rows = [], []
-    for policy, results in zip(policies, each, strict=True):
-        whose = f", seed {policy.config.seed}"
-        count, seed = VALIDATION_SCENARIOS, SEEDS.validation
-        validated = {
-            suite: _evaluate(policy, suite, count, duration, seed, whose, display)
-            for suite in HEADLINE
-        }
-        scores.append(_score(validated))
-        rows.append({"seed": policy.config.seed, "validation": validated, "evaluation": results})
-    best = scores.index(min(scores))
-    chosen = folder.seeds / f"seed-{policies[best].config.seed}.safetensors"
-    shutil.copyfile(chosen, folder.policy)
+    validated = [
+        _evaluate(policy, VALIDATION_SCENARIOS, duration, SEEDS.validation, True, display)
+        for policy in policies
+    ]
+    best = min(range(len(policies)), key=lambda k: _score(validated[k]))
+    seeds = [policy.config.seed for policy in policies]
+    write_atomically(folder.policy, folder.seed_policy(seeds[best]).read_bytes())
     summary = {suite: over_seeds([results[suite] for results in each]) for suite in HEADLINE}
-    written = {"best": policies[best].config.seed, "statistics": summary, "seeds": rows}
-    folder.seeds_summary.write_text(json.dumps(written, indent=2) + "\n")
-    display.say(f"best of the {len(policies)} seeds on the validation set: {written['best']}")
+    rows = [
+        {"seed": seed, "validation": validation, "evaluation": results}
+        for seed, validation, results in zip(seeds, validated, each, strict=True)
+    ]
+    write_json(folder.seeds_summary, {"best": seeds[best], "statistics": summary, "seeds": rows})
+    display.say(f"best of the {len(policies)} seeds on the validation set: {seeds[best]}")
     display.console.print(tables.seeds_table(summary))
     return best
 

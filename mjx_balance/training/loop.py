@@ -1,114 +1,205 @@
 """The loop of a run: calls of the compiled program, what they log, when they are saved."""
 
-import contextlib
+import atexit
 import json
+import math
+import os
 import signal
+import sys
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from mjx_balance.config import Config, to_dict
+from mjx_balance.config import Config
 from mjx_balance.display import Display
-from mjx_balance.dqn.learner import Learner, TrainState
-from mjx_balance.run_folder import RunFolder
-from mjx_balance.training.checkpoints import Checkpoints
-from mjx_balance.training.program_cache import compile_cached, digest
+from mjx_balance.dqn.learner import TrainState
+from mjx_balance.run_folder import RunFolder, keep_metrics_until
+from mjx_balance.training import checkpoints
+
+T = TypeVar("T")
 
 PER_SEED = ("tilt_deg", "falls_per_minute", "reward", "loss")
 """Metrics that are also logged for every seed, where there are several."""
+ANSWER_S = 0.2
+"""Longest time that the user waits for an answer to an interrupt, s."""
 
 Program = Callable[[TrainState], tuple[TrainState, Mapping[str, jax.Array]]]
 """A compiled call: many decisions of every env, and the means of what was measured."""
 
 
-class Units(NamedTuple):
-    """What turns the means of a call into the metrics that are logged."""
+class Plan(NamedTuple):
+    """A run as its loop sees it: plain numbers."""
 
+    num_envs: int
+    num_seeds: int
+    iterations: int
+    """Decisions of every env per call of the program."""
+    total: int
+    """Decisions at which the run ends, all envs of one seed, in whole calls."""
     decision_s: float
     """Length of a decision, s."""
     sim_steps: int
     """Physics steps per decision."""
-    per_call: int
-    """Decisions of one seed's envs in one call."""
-    num_seeds: int
+    checkpoint_seconds: float
+    """Time between two checkpoints, s."""
+
+    @property
+    def per_call(self) -> int:
+        """Decisions of one seed's envs in one call."""
+        return self.iterations * self.num_envs
+
+
+def make_plan(config: Config) -> Plan:
+    """The plan of a run whose config is sized to its devices."""
+    assert config.num_envs is not None
+    iterations = max(1, config.log_every // config.num_envs)
+    per_call = iterations * config.num_envs
+    return Plan(
+        num_envs=config.num_envs,
+        num_seeds=config.num_seeds,
+        iterations=iterations,
+        total=-(-config.num_env_steps // per_call) * per_call,
+        decision_s=config.task.ctrl_dt,
+        sim_steps=config.task.sim_steps,
+        checkpoint_seconds=config.checkpoint_seconds,
+    )
+
+
+class Interrupts:
+    """Interrupts of the user, collected so that the loop can stop between two calls.
+
+    The first is answered at once and asks the loop to stop; a second one raises
+    KeyboardInterrupt, which loses what was learnt since the last checkpoint.
+    """
+
+    def __init__(self, say: Callable[[str], None]):
+        """Answers with `say`; use as a context."""
+        self._say = say
+        self._received = 0
+        self._answered = False
+
+    def __bool__(self) -> bool:
+        """Whether there was one."""
+        return self._received > 0
+
+    def __enter__(self) -> "Interrupts":
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        self._previous = {number: signal.signal(number, self._receive) for number in numbers}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def run(self, call: Callable[..., T], *arguments: Any) -> T:
+        """Runs a call that may take a minute, and answers an interrupt meanwhile.
+
+        It runs in a thread of its own: Python handles no signal while the main thread is in
+        a compiled program.
+        """
+        future: Future[T] = Future()
+
+        def work() -> None:
+            try:
+                future.set_result(call(*arguments))
+            except BaseException as error:
+                future.set_exception(error)
+
+        threading.Thread(target=work, daemon=True).start()
+        while True:
+            try:
+                return future.result(ANSWER_S)
+            except TimeoutError:
+                if future.done():
+                    raise  # the call's own
+            except KeyboardInterrupt:
+                atexit.register(_leave, future)
+                raise
+            self._answer()
+
+    def _receive(self, number: int, frame: object) -> None:
+        self._received += 1
+        if self._received > 1:
+            raise KeyboardInterrupt
+
+    def _answer(self) -> None:
+        if self._received and not self._answered:
+            self._answered = True
+            self._say(
+                "stopping after this call and saving; interrupt again to quit at once, without "
+                "what was learnt since the last checkpoint"
+            )
+
+
+def _leave(call: Future[Any]) -> None:
+    """Ends the process at its exit if a call still runs: with it, Python would abort."""
+    if not call.done():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(128 + signal.SIGINT)
 
 
 def learn(
-    config: Config,
-    learner: Learner,
+    plan: Plan,
+    program: Program,
+    state: TrainState,
     folder: RunFolder,
-    resume: bool,
     display: Display,
-    stop: list[int],
+    stop: Interrupts,
 ) -> tuple[TrainState, float]:
-    """Trains until the last decision, or until the user stops; saves either way.
+    """Calls the program until the last decision or until the user stops; saves either way.
+
+    Every call is logged. What the folder has logged after the state's decisions is dropped
+    first: a resumed run logs it again.
 
     Returns:
       The last state, and the seconds spent learning by this call.
     """
-    checkpoints = Checkpoints(folder.checkpoints)
-    iterations = max(1, config.log_every // learner.num_envs)
-    per_call = iterations * learner.num_envs
-    with display.phase("compiling (about a minute the first time, seconds from then on)"):
-        state = learner.init(config.seed)
-        key = digest(to_dict(config), per_call)
-        program = compile_cached(learner.train_program(iterations), state, key)
-    if resume:
-        state = checkpoints.restore(state)
-        display.say(f"resuming at {number(state.env_steps):,} decisions")
-    drop_metrics_after(folder.metrics, number(state.env_steps))
-    units = Units(config.task.ctrl_dt, config.task.sim_steps, per_call, config.num_seeds)
-    total = -(-config.num_env_steps // per_call) * per_call
-    every = config.checkpoint_every
-    state, seconds = _repeat(
-        program, state, total, units, every, checkpoints, folder, display, stop
-    )
-    checkpoints.save(number(state.env_steps), state)
-    checkpoints.close()
-    return state, seconds
-
-
-def _repeat(
-    program: Program,
-    state: TrainState,
-    total: int,
-    units: Units,
-    checkpoint_every: int,
-    checkpoints: Checkpoints,
-    folder: RunFolder,
-    display: Display,
-    stop: list[int],
-) -> tuple[TrainState, float]:
-    """Calls the program until `total` decisions or until `stop`; logs every call."""
-    done = saved_at = number(state.env_steps)
+    done = number(state.env_steps)
+    keep_metrics_until(folder.metrics, done)
     seconds = 0.0
+    saved_at = time.monotonic()
     with (
         folder.metrics.open("a") as log,
-        SummaryWriter(str(folder.tensorboard)) as board,
-        display.training(done, total),
+        _board(folder, done) as board,
+        display.training(done, plan.total),
     ):
-        while done < total and not stop:
+        while done < plan.total and not stop:
             began = time.perf_counter()
-            state, raw = program(state)
-            done = number(state.env_steps)
+            state, raw = stop.run(_finished, program, state)
             elapsed = time.perf_counter() - began
             seconds += elapsed
-            metrics, seeds = measured(jax.device_get(raw), elapsed, units)
+            done = number(state.env_steps)
+            metrics, seeds = measured(raw, elapsed, plan)
             line = {"env_steps": done, "gradient_steps": number(state.gradient_steps)}
             log.write(json.dumps(line | metrics | seeds) + "\n")
             log.flush()
             for name, value in metrics.items():
                 board.add_scalar(name, value, done)
             display.update(done, metrics)
-            if done // checkpoint_every > saved_at // checkpoint_every:
-                checkpoints.save(done, state)
-                saved_at = done
+            if time.monotonic() - saved_at >= plan.checkpoint_seconds:
+                checkpoints.save(folder.checkpoints, done, state)
+                saved_at = time.monotonic()
+    checkpoints.save(folder.checkpoints, done, state)
     return state, seconds
+
+
+def _board(folder: RunFolder, done: int) -> SummaryWriter:
+    """A TensorBoard file, which says that whatever others have after `done` no longer counts."""
+    suffix = f".from-{done}"
+    return SummaryWriter(str(folder.tensorboard), purge_step=done + 1, filename_suffix=suffix)
+
+
+def _finished(program: Program, state: TrainState) -> tuple[TrainState, Mapping[str, np.ndarray]]:
+    """Calls the program and waits for what it gives; the measurements come to the host."""
+    state, raw = jax.block_until_ready(program(state))
+    return state, jax.device_get(raw)
 
 
 def number(count: jax.Array) -> int:
@@ -117,59 +208,34 @@ def number(count: jax.Array) -> int:
 
 
 def measured(
-    raw: Mapping[str, np.ndarray], seconds: float, units: Units
+    raw: Mapping[str, np.ndarray], seconds: float, plan: Plan
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """What a call measured, under the names it is logged by.
 
     Args:
-      raw: means over the call, one per seed if there are several.
+      raw: means over the call, one per seed if there are several; NaN where there was
+        nothing to measure, as the loss before the first update.
       seconds: that it took.
-      units: of the run.
+      plan: of the run.
 
     Returns:
-      Means over the seeds, and `{"seeds": {name: values}}` if there are several.
+      Means over the seeds that have a value, without those that none has, and, if there are
+      several seeds, `{"seeds": {name: values}}` with None for a seed without a value.
     """
-    raw = dict(raw)
-    raw["falls_per_minute"] = raw.pop("fall") * 60 / units.decision_s
-    metrics = {f"train/{name}": float(np.mean(value)) for name, value in raw.items()}
-    rate = units.num_seeds * units.per_call / seconds
+    values = {name: np.atleast_1d(np.asarray(value, float)) for name, value in raw.items()}
+    values["falls_per_minute"] = values.pop("fall") * 60 / plan.decision_s
+    if "diverged" in values:  # envs, not a share of the decisions
+        values["diverged"] *= plan.per_call
+    known = {name: value[np.isfinite(value)] for name, value in values.items()}
+    metrics = {f"train/{name}": float(value.mean()) for name, value in known.items() if value.size}
+    rate = plan.num_seeds * plan.per_call / seconds
     metrics["perf/env_steps_per_second"] = rate
-    metrics["perf/physics_steps_per_second"] = rate * units.sim_steps
-    if units.num_seeds == 1:
+    metrics["perf/physics_steps_per_second"] = rate * plan.sim_steps
+    if plan.num_seeds == 1:
         return metrics, {}
-    return metrics, {"seeds": {name: raw[name].tolist() for name in PER_SEED}}
-
-
-@contextlib.contextmanager
-def stop_on_interrupt() -> Iterator[list[int]]:
-    """Collects interrupt signals, so that the loop can stop between two calls.
-
-    A second one interrupts at once.
-    """
-    received: list[int] = []
-
-    def handler(number: int, frame: object) -> None:
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    previous = {}
-    for number in (signal.SIGINT, signal.SIGTERM):
-        previous[number] = signal.signal(number, handler)
-    try:
-        yield received
-    finally:
-        for number, old in previous.items():
-            signal.signal(number, old)
-
-
-def drop_metrics_after(path: Path, env_steps: int) -> None:
-    """Removes lines that a resumed run will write again, and what a crash left half-written."""
-    if not path.is_file():
-        return
-    kept = []
-    for text in path.read_text().splitlines():
-        with contextlib.suppress(ValueError, KeyError, TypeError):
-            if json.loads(text)["env_steps"] <= env_steps:
-                kept.append(f"{text}\n")
-    path.write_text("".join(kept))
+    per_seed = {
+        name: [x if math.isfinite(x) else None for x in values[name].tolist()]
+        for name in PER_SEED
+        if known[name].size
+    }
+    return metrics, {"seeds": per_seed}

@@ -2,21 +2,45 @@
 
 XLA's own persistent cache saves the compilation but not the tracing, which for
 MJX takes longer than loading the result. A traced program is stored as serialized
-StableHLO (`jax.export`) under a digest of everything it depends on.
+StableHLO (`jax.export`) under a digest of everything it is traced from. Both caches are
+an optional help: what is damaged or cannot be written is said and made anew.
 """
 
+import contextlib
 import hashlib
 import importlib.metadata
 import os
-from collections.abc import Callable
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import export
 
+from mjx_balance.config import Config, to_dict
+from mjx_balance.run_folder import write_atomically
 from mjx_balance.scene import scene_dir
+from mjx_balance.sources import code
+
+LIBRARIES = ("mjx_balance", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax")
+"""What a run's bits depend on besides this package's code."""
+NOT_TRACED = (
+    *("preset", "seed", "log_every", "checkpoint_seconds"),
+    *("eval_scenarios", "eval_duration"),
+)
+"""Fields of the config that the program is the same for; any other may change it."""
+FLAGS = (
+    *("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion"),
+    *("jax_default_prng_impl", "jax_threefry_partitionable", "jax_enable_custom_prng"),
+)
+"""Settings of JAX that change what a trace gives."""
+XLA_DAMAGED = "Error reading persistent compilation cache entry for '"
+
+Say: TypeAlias = Callable[[str], None]
+"""Takes one line for the user."""
 
 
 def cache_dir() -> Path:
@@ -25,27 +49,73 @@ def cache_dir() -> Path:
     return Path(os.environ.get("MJX_BALANCE_CACHE") or Path(base) / "mjx_balance")
 
 
-def enable_compilation_cache() -> None:
+def enable_compilation_cache(say: Say) -> None:
     """Turns XLA's persistent cache on for every program; call before compiling."""
-    jax.config.update("jax_compilation_cache_dir", str(cache_dir() / "xla"))
+    folder = cache_dir() / "xla"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        say(f"nothing is cached, {folder} cannot be written: {error.strerror}")
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def digest(*parts: object) -> str:
-    """Fingerprint of `parts`, this package's code, its scenes, the libraries and devices."""
-    state = hashlib.sha256(repr(parts).encode())
-    package = Path(__file__).resolve().parents[1]
-    for path in sorted([*package.rglob("*.py"), *scene_dir().glob("*.xml")]):
-        state.update(path.read_bytes())
-    for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax"):
-        state.update(importlib.metadata.version(name).encode())
-    devices = jax.devices()
-    state.update(f"{devices[0].device_kind}{len(devices)}".encode())
-    return state.hexdigest()[:32]
+@contextlib.contextmanager
+def mending_xla_cache(say: Say) -> Iterator[None]:
+    """Compile in here: what XLA finds damaged in its cache is said, and taken away.
+
+    XLA compiles anew then, but would neither use nor replace the file.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.filterwarnings("always", message=XLA_DAMAGED)
+        yield
+    for warning in caught:
+        said = str(warning.message)
+        if not said.startswith(XLA_DAMAGED):
+            warnings.warn_explicit(
+                warning.message, warning.category, warning.filename, warning.lineno
+            )
+            continue
+        module = said.removeprefix(XLA_DAMAGED).partition("'")[0]
+        for entry in (cache_dir() / "xla").glob(f"{module}-*-cache"):
+            entry.unlink(missing_ok=True)
+        say(f"compiled anew: what {cache_dir() / 'xla'} had of {module} was damaged")
 
 
-def compile_cached(
-    program: Callable[[Any], tuple[Any, Any]], state: Any, key: str
+def versions() -> dict[str, str | None]:
+    """Installed versions of `LIBRARIES`."""
+    found: dict[str, str | None] = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def program_key(config: Config, iterations: int, root: str) -> str:
+    """Fingerprint of a training program: equal for equal programs, whatever is around them.
+
+    Args:
+      config: of the run; `NOT_TRACED` does not count.
+      iterations: decisions of every env per call.
+      root: module that builds the program; it and what it imports are what is traced.
+    """
+    values = {k: v for k, v in to_dict(config).items() if k not in NOT_TRACED}
+    devices = [(device.platform, device.device_kind) for device in jax.devices()]
+    flags = [str(getattr(jax.config, name)) for name in FLAGS]
+    key = hashlib.sha256(repr((values, iterations, devices, flags, versions())).encode())
+    key.update(repr(sorted(code(root).items())).encode())
+    for path in sorted(scene_dir().glob("*.xml")):
+        key.update(path.name.encode() + b"\0" + path.read_bytes())
+    return key.hexdigest()[:32]
+
+
+def compile_program(
+    program: Callable[[Any], tuple[Any, Any]], state: Any, key: str, say: Say
 ) -> Callable[[Any], tuple[Any, Any]]:
     """Compiles a jitted `state -> (state, output)`, from the cache where it can.
 
@@ -53,28 +123,23 @@ def compile_cached(
       program: jitted; traced only if the cache does not know `key`. The state it
         returns has the structure of its argument, whose buffers are donated.
       state: an example, on its devices.
-      key: from `digest`.
+      key: from `program_key`.
+      say: told what is wrong with the cache.
 
     Returns:
       The compiled program.
     """
     leaves, structure = jax.tree.flatten(state)
-    folder = cache_dir() / "programs"
-    path = folder / f"{key}.stablehlo"
+    path = cache_dir() / "programs" / f"{key}.stablehlo"
 
     def flat(leaves: list[jax.Array]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
         state, output = program(jax.tree.unflatten(structure, leaves))
         return jax.tree.leaves(state), output
 
-    if path.is_file():
-        _initialize_lapack()
-        exported = export.deserialize(bytearray(path.read_bytes()))
-    else:
+    exported = _load(path, say)
+    if exported is None:
         exported = export.export(jax.jit(flat, donate_argnums=0))(leaves)
-        folder.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(f".{os.getpid()}")
-        part.write_bytes(exported.serialize())
-        part.replace(path)
+        _store(path, exported, say)
     compiled = jax.jit(exported.call, donate_argnums=0).lower(leaves).compile()
 
     def run(state: Any) -> tuple[Any, Any]:
@@ -82,6 +147,31 @@ def compile_cached(
         return jax.tree.unflatten(structure, leaves), output
 
     return run
+
+
+def _load(path: Path, say: Say) -> export.Exported | None:
+    """A traced program from its file, a digest and the program; none if it is not there."""
+    try:
+        content = path.read_bytes()
+        digest, program = content[:32], content[32:]
+        if hashlib.sha256(program).digest() != digest:
+            raise ValueError("it is damaged")
+        _initialize_lapack()
+        return export.deserialize(bytearray(program))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        say(f"the cached program {path} is made anew: {error}")
+        return None
+
+
+def _store(path: Path, exported: export.Exported, say: Say) -> None:
+    program = bytes(exported.serialize())
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, hashlib.sha256(program).digest() + program)
+    except OSError as error:
+        say(f"the program is not cached, {path} cannot be written: {error.strerror}")
 
 
 def _initialize_lapack() -> None:

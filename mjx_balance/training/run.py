@@ -1,19 +1,31 @@
 """A run from its config to its last table."""
 
+import contextlib
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from mjx_balance.config import Config, check
 from mjx_balance.display import Display
+from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.env import BalanceEnv
-from mjx_balance.run_folder import RunFolder, check_same_config, create_run_folder, read_run_config
-from mjx_balance.training import devices, finish, loop
+from mjx_balance.run_folder import (
+    RunFolder,
+    check_same_config,
+    check_same_provenance,
+    create_run_folder,
+    locked,
+    read_run_config,
+)
+from mjx_balance.training import checkpoints, devices, finish, loop, program_cache
+from mjx_balance.training.program_cache import Say
 
 
 class Interrupted(Exception):
-    """The user stopped the run; everything is saved."""
+    """The user stopped the run; the message says what is saved and how to go on."""
 
 
 def train(
@@ -32,47 +44,102 @@ def train(
 
     Raises:
       ConfigError: for an impossible config.
+      EvaluationError: for an evaluation that would not fit into the memory.
       RunFolderError: for a folder that cannot be used.
-      CheckpointError: for a folder without a checkpoint to continue from.
-      Interrupted: if the user stopped the run, after saving it.
+      CheckpointError: for a folder whose checkpoints are damaged.
+      PolicyError: if no seed learnt a policy of finite numbers.
+      Interrupted: if the user stopped the run.
     """
     began = time.perf_counter()
-    check(config)
-    devices.configure_jax()
-    config = devices.size_to_device(config)
+    devices.configure_jax(display.say)
+    config = devices.size_to_device(check(config))
+    finish.check_fits(config)
     env = BalanceEnv(config)
     learner = devices.make_learner(config, env)
     devices.check_memory(learner)
-    folder = _open_folder(config, run_dir, resume)
-    _announce(config, folder, display)
-    with loop.stop_on_interrupt() as stop:
-        state, seconds = loop.learn(config, learner, folder, resume is not None, display, stop)
-        policies = finish.export(config, learner, env.scene.hash, folder, state, seconds)
-        if stop:
-            raise Interrupted(
-                f"stopped at {loop.number(state.env_steps):,} decisions; the policy so far is "
-                f"{folder.policy}; continue with --resume {folder.path}"
+    folder = _open_folder(config, provenance(env), run_dir, resume, display.say)
+    with locked(folder), _resumable(folder):
+        with loop.Interrupts(display.say) as stop:
+            state, seconds = _learn(config, learner, folder, display, stop)
+            policies = finish.export(
+                config, learner, env.scene.hash, folder, state, seconds, display.say
             )
-    return finish.finish(config, policies, folder, display, began)
+            if stop:
+                raise Interrupted(
+                    f"stopped at {loop.number(state.env_steps):,} decisions; the policy so far "
+                    f"is {folder.policy}; continue with --resume {folder.path}"
+                )
+        return finish.finish(config, policies, folder, display, began)
 
 
-def _open_folder(config: Config, run_dir: Path | None, resume: Path | None) -> RunFolder:
-    """The folder of a new run, or of the run to continue.
+def provenance(env: BalanceEnv) -> dict[str, Any]:
+    """What decides a run besides its config; a resumed run compares it with its own."""
+    return {
+        "scene_hash": env.scene.hash,
+        "engine": env.backend,
+        "versions": program_cache.versions(),
+    }
+
+
+def _open_folder(
+    config: Config, today: Mapping[str, Any], run_dir: Path | None, resume: Path | None, say: Say
+) -> RunFolder:
+    """The folder of a new run, or of the run to continue; says what will run where.
 
     Raises:
       RunFolderError: if it cannot be used.
     """
     if resume is None:
         name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-        return create_run_folder(run_dir or Path("runs") / name, config)
-    check_same_config(read_run_config(resume), config, resume)
-    return RunFolder(resume)
-
-
-def _announce(config: Config, folder: RunFolder, display: Display) -> None:
+        folder = create_run_folder(run_dir or Path("runs") / name, config, today)
+    else:
+        check_same_config(read_run_config(resume), config, resume)
+        warning = check_same_provenance(resume, today)
+        if warning is not None:
+            say(warning)
+        folder = RunFolder(resume)
     last = config.seed + config.num_seeds - 1
     seeds = f"seed {last}" if last == config.seed else f"seeds {config.seed} to {last}"
-    display.say(
+    say(
         f"{folder.path}: preset {config.preset}, {seeds}, {config.num_envs} envs on "
         f"{config.num_devices} {jax.devices()[0].device_kind} device(s)"
     )
+    return folder
+
+
+def _learn(
+    config: Config,
+    learner: Learner,
+    folder: RunFolder,
+    display: Display,
+    stop: loop.Interrupts,
+) -> tuple[TrainState, float]:
+    """Goes on from the newest checkpoint, if there is one, to the last decision.
+
+    Returns:
+      The last state, and the seconds spent learning by this call.
+    """
+    plan = loop.make_plan(config)
+    program = learner.train_program(plan.iterations)
+    compiling = display.phase("compiling (about a minute the first time, seconds from then on)")
+    with compiling, program_cache.mending_xla_cache(display.say):
+        state = stop.run(learner.init, config.seed)
+        saved = checkpoints.restore(folder.checkpoints, state, display.say)
+        if saved is not None:
+            state = saved
+            display.say(f"resuming at {loop.number(state.env_steps):,} decisions")
+        if loop.number(state.env_steps) < plan.total:
+            key = program_cache.program_key(config, plan.iterations, devices.__name__)
+            program = stop.run(program_cache.compile_program, program, state, key, display.say)
+    return loop.learn(plan, program, state, folder, display, stop)
+
+
+@contextlib.contextmanager
+def _resumable(folder: RunFolder) -> Iterator[None]:
+    """Turns an interrupt that nobody awaited into a sentence: the folder is whole anyway."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise Interrupted(
+            f"stopped at once; continue from the last checkpoint with --resume {folder.path}"
+        ) from error

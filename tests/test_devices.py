@@ -1,0 +1,156 @@
+"""What a run computes on: sizes that fit the devices, and a state that fits the memory."""
+
+import dataclasses
+import types
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import psutil
+import pytest
+
+from mjx_balance.config import ConfigError, preset
+from mjx_balance.dqn import learner as learner_module
+from mjx_balance.env import BalanceEnv
+from mjx_balance.training import devices
+from mjx_balance.training.devices import check_memory, make_learner, size_to_device
+
+CONFIG = preset("default")
+
+
+def with_batch(size: int, **changes: Any):
+    """One gradient step per decision of an env: a whole number, whatever their number."""
+    dqn = dataclasses.replace(CONFIG.dqn, batch_size=size, replay_ratio=float(size))
+    return dataclasses.replace(CONFIG, dqn=dqn, **changes)
+
+
+def test_a_cpu_gets_256_envs_over_both_cores() -> None:
+    sized = size_to_device(CONFIG)
+    assert (sized.num_envs, sized.num_devices) == (256, 2)
+    assert dataclasses.replace(sized, num_envs=None, num_devices=None) == CONFIG
+
+
+def test_an_accelerator_gets_2048(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "devices", lambda: [types.SimpleNamespace(platform="gpu")])
+    sized = size_to_device(CONFIG)
+    assert (sized.num_envs, sized.num_devices) == (2048, 1)
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "batch_size", "available", "expected"),
+    [(64, 512, 8, 8), (60, 512, 8, 4), (64, 510, 8, 2), (63, 512, 8, 1), (6, 9, 4, 3)],
+)
+def test_as_many_devices_as_share_evenly(
+    num_envs: int, batch_size: int, available: int, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cpus = [types.SimpleNamespace(platform="cpu")] * available
+    monkeypatch.setattr(jax, "devices", lambda: cpus)
+    sized = size_to_device(with_batch(batch_size, num_envs=num_envs))
+    assert sized.num_devices == expected
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        (with_batch(512, num_devices=3), "num_devices is 3; this machine has 2 JAX devices"),
+        (with_batch(511, num_devices=2), "batch_size is 511; it must be a multiple of num_dev"),
+        (with_batch(512, num_devices=2, num_envs=9), "num_envs is 9; it must be a multiple of"),
+    ],
+)
+def test_what_cannot_be_shared_is_refused(config: Any, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        size_to_device(config)
+
+
+def test_sizes_that_are_given_stay() -> None:
+    given = with_batch(512, num_envs=32, num_devices=1)
+    assert size_to_device(given) == given
+
+
+def test_a_replay_smaller_than_one_decision_of_all_envs_is_refused() -> None:
+    dqn = dataclasses.replace(CONFIG.dqn, replay_capacity=255, min_replay_size=10)
+    with pytest.raises(ConfigError, match="replay_capacity is 255; it must hold at least one"):
+        size_to_device(dataclasses.replace(CONFIG, dqn=dqn))
+
+
+@pytest.mark.parametrize(
+    ("head", "factors"), [("joint", (441,)), ("factored", (21, 21)), ("radial", (21, 21))]
+)
+def test_the_learner_is_the_configs(
+    head: Any, factors: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lengths: list[int] = []
+    make = learner_module.make_optimizer
+    monkeypatch.setattr(
+        learner_module, "make_optimizer", lambda dqn, n: (lengths.append(n), make(dqn, n))[1]
+    )
+    dqn = dataclasses.replace(CONFIG.dqn, head=head, hidden_sizes=(8, 4), replay_ratio=512.0)
+    config = dataclasses.replace(
+        CONFIG, num_envs=32, num_devices=1, num_env_steps=320, num_seeds=3, dqn=dqn
+    )
+    env = BalanceEnv(config)
+    learner = make_learner(config, env)
+    network = learner.network
+    assert (network.hidden_sizes, network.factors) == ((8, 4), factors)
+    assert network.radial == (head == "radial")
+    assert (learner.env, learner.config) == (env, dqn)
+    assert (learner.num_envs, learner.num_devices, learner.num_seeds) == (32, 1, 3)
+    assert learner.action_factors == (21, 21)
+    assert learner.symmetries is not None
+    assert learner.first_reset == env.reset_staggered
+    # 10 decisions of 32 envs, each transition replayed 512 times in batches of 512.
+    assert lengths == [320]
+
+
+MIB = 2**20
+
+
+class Learner:
+    """With a state of 3 MiB on a device of some kind."""
+
+    num_seeds, num_envs = 2, 64
+    config = CONFIG.dqn
+
+    def __init__(self, device: Any, num_devices: int = 1) -> None:
+        self.mesh = types.SimpleNamespace(devices=np.asarray([device] * num_devices))
+        self.num_devices = num_devices
+
+    def init(self, seed: int) -> Any:
+        return {"a": jnp.zeros((MIB // 2,), jnp.float32), "b": jnp.zeros((MIB,), jnp.int8)}
+
+
+def cpu() -> Any:
+    return types.SimpleNamespace(platform="cpu")
+
+
+def gpu(limit: int | None) -> Any:
+    stats = None if limit is None else {"bytes_limit": limit}
+    return types.SimpleNamespace(platform="gpu", memory_stats=lambda: stats)
+
+
+def needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "PROGRAM_BYTES", 100 * MIB)
+
+
+def test_a_state_must_fit_twice_beside_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs(monkeypatch)
+    free = [106 * MIB]
+    memory = lambda: types.SimpleNamespace(available=free[0])  # noqa: E731
+    monkeypatch.setattr(psutil, "virtual_memory", memory)
+    learner: Any = Learner(cpu())
+    check_memory(learner)
+    free[0] -= 1
+    with pytest.raises(ConfigError, match="num_seeds is 2, num_envs 64 and replay_capacity 131072"):
+        check_memory(learner)
+
+
+def test_every_accelerator_takes_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs(monkeypatch)
+    fits: Any = Learner(gpu(53 * MIB), num_devices=2)
+    check_memory(fits)
+    too_much: Any = Learner(gpu(52 * MIB), num_devices=2)
+    with pytest.raises(ConfigError, match=r"takes about 0\.1 GiB, and 0\.1 GiB are free"):
+        check_memory(too_much)
+    unknown: Any = Learner(gpu(None))
+    check_memory(unknown)

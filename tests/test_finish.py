@@ -1,0 +1,249 @@
+"""The end of a run: a policy per seed that has one, the best of them, and files written whole."""
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+from tensorboardX.proto.event_pb2 import Event
+
+from mjx_balance import load_policy
+from mjx_balance.config import ConfigError, preset
+from mjx_balance.display import Display
+from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.policy import Policy, PolicyError
+from mjx_balance.robots import find_robot
+from mjx_balance.run_folder import RunFolder
+from mjx_balance.suites import SEEDS
+from mjx_balance.task.observation import observation_names
+from mjx_balance.training import finish
+
+CONFIG = preset("smoke")
+SEED = CONFIG.seed
+
+
+class State(NamedTuple):
+    params: Any
+    env_steps: Any
+    gradient_steps: Any
+    env_state: Any
+    replay: Any
+
+
+class Learner:
+    """Exports parameters as they are."""
+
+    network = QNetwork(CONFIG.dqn.hidden_sizes, (21, 21), radial=True)
+
+    @staticmethod
+    def exported(state: State) -> Any:
+        assert state.env_state is None  # may be gigabytes
+        assert state.replay is None
+        return state.params
+
+
+OBS = len(observation_names(CONFIG.task, find_robot(CONFIG.robot)))
+PARAMS = Learner.network.init(jax.random.PRNGKey(0), jnp.zeros(OBS))
+
+
+def state_of(*scales: float) -> State:
+    """Of as many seeds, parameters times a scale: not a number, for a seed that diverged."""
+    count = jnp.full(len(scales), 64)
+    params = jax.tree.map(lambda x: jnp.stack([x * scale for scale in scales]), PARAMS)
+    state = State(params, count, 3 * count, count, count)
+    return state if len(scales) > 1 else jax.tree.map(lambda x: x[0], state)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    return RunFolder(tmp_path)
+
+
+def export(folder: RunFolder, *scales: float) -> tuple[list[Policy], list[str]]:
+    config = dataclasses.replace(CONFIG, num_seeds=len(scales))
+    said: list[str] = []
+    state: Any = state_of(*scales)
+    learner: Any = Learner()
+    return finish.export(config, learner, "hash", folder, state, 1.26, said.append), said
+
+
+def first_weight(policy: Policy) -> float:
+    return float(policy._layers[0][0].ravel()[0])
+
+
+FIRST = float(PARAMS["params"]["hidden_0"]["kernel"].ravel()[0])  # pyright: ignore
+
+
+def test_one_seed_gives_one_policy(folder: RunFolder) -> None:
+    [policy], said = export(folder, 2.0)
+    assert said == []
+    saved = load_policy(folder.policy)
+    assert saved.fingerprint == policy.fingerprint
+    assert first_weight(saved) == pytest.approx(2 * FIRST)
+    assert saved.scene_hash == "hash"
+    training = saved.manifest["training"]
+    assert (training["env_steps"], training["gradient_steps"]) == (64, 192)
+    assert training["seconds_learning_since_start_or_resume"] == 1.3
+    assert not folder.seeds.exists()
+
+
+def test_every_seed_gives_a_policy_of_its_own(folder: RunFolder) -> None:
+    policies, _ = export(folder, 1.0, 2.0, 3.0)
+    for k, policy in enumerate(policies):
+        saved = load_policy(folder.seed_policy(SEED + k))
+        assert saved.fingerprint == policy.fingerprint
+        assert first_weight(saved) == pytest.approx((k + 1) * FIRST)
+        assert (saved.config.seed, saved.config.num_seeds) == (SEED + k, 1)
+    assert load_policy(folder.policy).fingerprint == policies[0].fingerprint
+
+
+def test_a_diverged_seed_does_not_hold_the_others_up(folder: RunFolder) -> None:
+    policies, said = export(folder, np.nan, 2.0, np.inf, 4.0)
+    assert [policy.config.seed for policy in policies] == [SEED + 1, SEED + 3]
+    assert len(said) == 2
+    assert said[0].startswith(f"seed {SEED} gives no policy: weight ")
+    assert said[1].startswith(f"seed {SEED + 2} gives no policy: weight ")
+    assert "not finite numbers" in said[0]
+    assert load_policy(folder.policy).config.seed == SEED + 1
+
+
+@pytest.mark.parametrize("scales", [(np.nan,), (np.nan, np.nan)])
+def test_no_policy_at_all_is_said(folder: RunFolder, scales: tuple[float, ...]) -> None:
+    with pytest.raises(PolicyError, match="learnt no policy of finite numbers; lower learning"):
+        export(folder, *scales)
+    assert not folder.policy.exists()
+
+
+def test_an_evaluation_beyond_the_memory_is_refused_by_its_field() -> None:
+    finish.check_fits(CONFIG)
+    with pytest.raises(ConfigError, match="eval_scenarios is 100000000 and duration 20 s: that"):
+        finish.check_fits(dataclasses.replace(CONFIG, eval_scenarios=100_000_000))
+    with pytest.raises(ConfigError, match="GiB are free"):
+        finish.check_fits(dataclasses.replace(CONFIG, eval_duration=1e12))
+
+
+def result(suite: str, falls: int, mean: float, seed: int) -> dict[str, Any]:
+    tilts = {"mean": mean, "rms": mean, "p50": mean, "p95": mean, "p99": mean, "max": mean}
+    values = {"suite": suite, "scenarios": 4, "falls": falls, "seed": seed, "tilt_deg": tilts}
+    return values | {"action_mm_mean": 1.0, "action_mm_settled": 0.0, "duration_s": 5.0}
+
+
+VALIDATION = {SEED: (0, 0.5), SEED + 1: (0, 0.4), SEED + 2: (1, 0.1), SEED + 3: (0, 0.6)}
+"""Seed -> falls and mean tilt per suite: seed 1 is best, as a fall outweighs any tilt."""
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What `finish` asked of evaluation and report, in order."""
+    asked: list[Any] = []
+
+    def evaluate(
+        policy: Policy, suite: str, scenarios: int, duration: float, seed: int, bar: Any
+    ) -> dict[str, Any]:
+        asked.append((policy.config.seed, suite, scenarios, duration, seed))
+        bar(1.0)
+        falls, mean = VALIDATION[policy.config.seed]
+        if seed == SEEDS.final:  # the other way round: it must not decide
+            falls, mean = 7, 1 - mean
+        return result(suite, falls, mean, seed)
+
+    def draw(folder: RunFolder) -> None:
+        assert not folder.evaluation.exists()
+        asked.append(("figures", load_policy(folder.policy).config.seed))
+
+    monkeypatch.setattr(finish.evaluation, "evaluate", evaluate)
+    monkeypatch.setattr(finish, "_draw", draw)
+    monkeypatch.setattr(finish.tables, "print_summary", lambda *given: asked.append("summary"))
+    return asked
+
+
+def finished(folder: RunFolder, *scales: float) -> dict[str, Any]:
+    policies, _ = export(folder, *scales)
+    config = dataclasses.replace(CONFIG, num_seeds=len(scales), eval_scenarios=4, eval_duration=5.0)
+    display = Display(Console(file=io.StringIO(), width=200))
+    return finish.finish(config, policies, folder, display, 0.0)
+
+
+def test_one_seed_is_evaluated_on_both_suites(folder: RunFolder, calls: list[Any]) -> None:
+    results = finished(folder, 1.0)
+    seed = SEEDS.final
+    assert calls == [
+        (SEED, "paper", 4, 5.0, seed),
+        (SEED, "corner", 4, 5.0, seed),
+        ("figures", SEED),
+        "summary",
+    ]
+    assert json.loads(folder.evaluation.read_text()) == results
+    assert results["corner"]["tilt_deg"]["mean"] == 0.5
+    assert not folder.seeds_summary.exists()
+
+
+def test_the_best_seed_is_chosen_by_the_validation_alone(
+    folder: RunFolder, calls: list[Any]
+) -> None:
+    results = finished(folder, 1.0, 2.0, 3.0, 4.0)
+    assert load_policy(folder.policy).config.seed == SEED + 1
+    assert ("figures", SEED + 1) in calls
+    seeds = json.loads(folder.seeds_summary.read_text())
+    assert seeds["best"] == SEED + 1
+    assert [row["seed"] for row in seeds["seeds"]] == [SEED, SEED + 1, SEED + 2, SEED + 3]
+    assert seeds["seeds"][1]["evaluation"] == results
+    assert json.loads(folder.evaluation.read_text()) == results
+    assert results["paper"]["tilt_deg"]["mean"] == pytest.approx(0.6)
+    validated = seeds["seeds"][2]["validation"]["paper"]
+    assert (validated["falls"], validated["seed"]) == (1, SEEDS.validation)
+    assert seeds["statistics"]["corner"]["seeds"] == 4
+    assert seeds["statistics"]["corner"]["falls"] == 28
+    asked = {call[2:] for call in calls if len(call) == 5}
+    assert asked == {
+        (4, 5.0, SEEDS.final),
+        (finish.VALIDATION_SCENARIOS, 5.0, SEEDS.validation),
+    }
+    assert SEEDS.final != SEEDS.validation
+
+
+def test_a_diverged_seed_is_never_chosen(folder: RunFolder, calls: list[Any]) -> None:
+    finished(folder, 1.0, np.nan, 3.0)
+    seeds = json.loads(folder.seeds_summary.read_text())
+    assert [row["seed"] for row in seeds["seeds"]] == [SEED, SEED + 2]
+    assert seeds["best"] == SEED
+    assert load_policy(folder.policy).config.seed == SEED
+    folder.evaluation.unlink()
+    finished(folder, 1.0, np.nan)  # the only one left needs no rival
+    assert json.loads(folder.seeds_summary.read_text())["best"] == SEED
+
+
+def test_a_run_killed_while_it_finishes_finishes_again(
+    folder: RunFolder, calls: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It counts as finished only once all is written, and TensorBoard has it once."""
+
+    class Killed(BaseException):
+        pass
+
+    def die(*given: Any) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(finish, "_draw", die)
+        with pytest.raises(Killed):
+            finished(folder, 1.0)
+    assert not folder.evaluation.exists()
+    finished(folder, 1.0)
+    tags: list[str] = []
+    for file in folder.tensorboard.iterdir():
+        content = file.read_bytes()
+        while content:
+            length = int.from_bytes(content[:8], "little")
+            event = Event.FromString(content[12 : 12 + length])
+            tags += [value.tag for value in event.summary.value]
+            assert not event.summary.value or event.step == 64
+            content = content[16 + length :]
+    names = ["falls", *(f"tilt_{name}" for name in ("mean", "rms", "p50", "p95", "p99", "max"))]
+    assert sorted(tags) == sorted(f"eval/{s}/{n}" for s in ("paper", "corner") for n in names)

@@ -1,0 +1,267 @@
+"""The program cache: traced once, keyed by what is traced, and never in the way."""
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from mjx_balance.config import Config, flatten, preset, to_dict
+from mjx_balance.sources import code
+from mjx_balance.training import devices, program_cache
+from mjx_balance.training.program_cache import (
+    NOT_TRACED,
+    compile_program,
+    program_key,
+)
+
+ROOT = devices.__name__
+CONFIG = preset("smoke")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of its own."""
+    monkeypatch.setenv("MJX_BALANCE_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+class State(NamedTuple):
+    number: jax.Array
+    parts: dict[str, jax.Array]
+
+
+def start() -> State:
+    return State(jnp.int32(1), {"a": jnp.arange(3.0), "b": jnp.zeros(2)})
+
+
+class Counter:
+    """A program that counts how often it is traced."""
+
+    def __init__(self) -> None:
+        self.traced = 0
+        self.program = jax.jit(self._step)
+
+    def _step(self, state: State) -> tuple[State, dict[str, jax.Array]]:
+        self.traced += 1
+        parts = {"a": 2 * state.parts["a"], "b": state.parts["b"] - 1}
+        return State(state.number + 1, parts), {"sum": state.parts["a"].sum()}
+
+
+def check_run(program: Callable[[Any], tuple[Any, Any]]) -> None:
+    """The program does what it did before it was stored."""
+    state, output = program(start())
+    assert int(state.number) == 2
+    np.testing.assert_array_equal(state.parts["a"], (0, 2, 4))
+    np.testing.assert_array_equal(state.parts["b"], (-1, -1))
+    assert float(output["sum"]) == 3
+
+
+def test_a_second_start_traces_nothing(cache: Path) -> None:
+    first, second = Counter(), Counter()
+    check_run(compile_program(first.program, start(), "key", pytest.fail))
+    assert first.traced == 1
+    files = list((cache / "programs").iterdir())
+    assert [file.name for file in files] == ["key.stablehlo"]
+    check_run(compile_program(second.program, start(), "key", pytest.fail))
+    assert second.traced == 0
+    compile_program(second.program, start(), "other", pytest.fail)
+    assert second.traced == 1
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[:-1],
+        lambda content: content[:100] + b"!" + content[101:],
+        lambda content: b"x" * 40,
+    ],
+)
+def test_a_damaged_program_is_said_and_replaced(
+    cache: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    compile_program(Counter().program, start(), "key", pytest.fail)
+    file = cache / "programs" / "key.stablehlo"
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    said: list[str] = []
+    again = Counter()
+    check_run(compile_program(again.program, start(), "key", said.append))
+    assert again.traced == 1
+    assert said == [f"the cached program {file} is made anew: it is damaged"]
+    compile_program(again.program, start(), "key", pytest.fail)
+    assert again.traced == 1
+
+
+def test_a_cache_that_cannot_be_written_is_said_and_done_without(cache: Path) -> None:
+    cache.write_text("no folder")
+    said: list[str] = []
+    check_run(compile_program(Counter().program, start(), "key", said.append))
+    program_cache.enable_compilation_cache(said.append)
+    assert len(said) == 3  # neither read nor written, nor what XLA keeps
+    for line in said[1:]:
+        assert "cannot be written: Not a directory" in line
+    assert cache.read_text() == "no folder"
+
+
+@pytest.fixture
+def xla_cache(cache: Path) -> Iterator[Path]:
+    """XLA's own cache, turned on as a run does."""
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    compilation_cache.reset_cache()
+    program_cache.enable_compilation_cache(pytest.fail)
+    assert jax.config.jax_persistent_cache_min_compile_time_secs == 0.5
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    yield cache / "xla"
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def test_what_xla_finds_damaged_is_said_and_taken_away(xla_cache: Path) -> None:
+    def start() -> list[str]:
+        said: list[str] = []
+        with program_cache.mending_xla_cache(said.append):
+            assert jax.jit(lambda x: 2 * x + 1)(3) == 7
+        return said
+
+    def entries() -> list[Path]:
+        return sorted(xla_cache.glob("jit__lambda*-cache"))
+
+    assert start() == []
+    [whole] = entries()
+    assert start() == []
+    whole.write_bytes(whole.read_bytes()[:50])
+    other = xla_cache / "jit_other-1-cache"
+    other.write_text("not looked at")
+    assert start() == [f"compiled anew: what {xla_cache} had of jit__lambda was damaged"]
+    assert entries() == []
+    assert other.exists()
+    assert start() == []
+    assert entries() == [whole]
+
+
+def test_other_warnings_are_passed_on() -> None:
+    passed_on = pytest.warns(UserWarning, match="mind the gap")
+    with passed_on, program_cache.mending_xla_cache(pytest.fail):
+        warnings.warn("mind the gap", stacklevel=1)
+
+
+def key(config: Config = CONFIG, iterations: int = 16) -> str:
+    return program_key(config, iterations, ROOT)
+
+
+def test_the_same_run_has_the_same_key_and_another_seed_too() -> None:
+    assert key() == key()
+    others = {"seed": 5, "preset": "best", "log_every": 7, "checkpoint_seconds": 1.0}
+    others |= {"eval_scenarios": 3, "eval_duration": 1.0}
+    assert set(others) == set(NOT_TRACED)
+    assert key(dataclasses.replace(CONFIG, **others)) == key()
+
+
+def test_every_other_number_changes_the_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(program_cache, "code", lambda root: {})  # the same for all
+    keys = {key(), key(iterations=17)}
+    values = to_dict(CONFIG)
+    places = [((name,), value) for name, value in values.items() if not isinstance(value, dict)]
+    for section, fields in values.items():
+        if isinstance(fields, dict):
+            places += [((section, name), value) for name, value in flatten(fields).items()]
+    count = 2
+    for (*section, name), value in places:
+        if name in NOT_TRACED:
+            continue
+        change: dict[str, Any] = {name: f"{value} and more"}
+        if section:
+            inner = dataclasses.replace(getattr(CONFIG, section[0]), **change)
+            change = {section[0]: inner}
+        keys.add(key(dataclasses.replace(CONFIG, **change)))
+        count += 1
+    assert len(keys) == count > 60
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [
+        ("jax_default_matmul_precision", "float32"),
+        ("jax_enable_x64", True),
+        ("jax_default_prng_impl", "rbg"),
+        ("jax_threefry_partitionable", False),
+    ],
+)
+def test_settings_of_jax_change_the_key(flag: str, value: object) -> None:
+    before, was = key(), getattr(jax.config, flag)
+    jax.config.update(flag, value)
+    try:
+        assert key() != before
+    finally:
+        jax.config.update(flag, was)
+    assert key() == before
+
+
+def test_a_library_and_a_device_change_the_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = key()
+    for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "mjx_balance"):
+        with monkeypatch.context() as patch:
+            changed = program_cache.versions() | {name: "99"}
+            patch.setattr(program_cache, "versions", lambda changed=changed: changed)
+            assert key() != before
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "devices", lambda: jax.local_devices()[:1])
+        assert key() != before
+    assert key() == before
+
+
+def test_the_code_that_is_traced_is_found_and_no_other() -> None:
+    found = {name.removeprefix("mjx_balance.") for name in code(ROOT)}
+    traced = "env engines.mjx scene config task task.reward task.decision training.devices"
+    traced += " dqn.learner dqn.updating dqn.collecting dqn.losses dqn.networks dqn.replay"
+    assert set(traced.split()) <= found
+    others = "cli display evaluation render controllers report training.finish training.loop"
+    assert not found & set(others.split())
+    assert not [name for name in found if name.startswith("report")]
+
+
+def test_an_edit_of_what_is_traced_changes_the_key_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "copy"
+    (package / "inner").mkdir(parents=True)
+    files = {
+        "root.py": "from mjx_balance.inner.deep import f\nimport mjx_balance.direct, os",
+        "direct.py": "x = 1",
+        "inner/__init__.py": "",
+        "inner/deep.py": "def f():\n    from mjx_balance import lazy\n",
+        "lazy.py": "from mjx_balance import root",
+        "report.py": "from mjx_balance import root",
+    }
+    for name, text in files.items():
+        (package / name).write_text(text)
+    (tmp_path / "scenes").mkdir()
+    scene = tmp_path / "scenes" / "robot.xml"
+    scene.write_text("<mujoco/>")
+    found = code("mjx_balance.root", package)
+    names = sorted(name.removeprefix("mjx_balance.") for name in found)
+    assert names == ["direct", "inner", "inner.deep", "lazy", "root"]
+    monkeypatch.setattr(program_cache, "code", lambda root: code(root, package))
+    monkeypatch.setattr(program_cache, "scene_dir", lambda: tmp_path / "scenes")
+
+    def today() -> str:
+        return program_key(CONFIG, 1, "mjx_balance.root")
+
+    before = today()
+    (package / "report.py").write_text("changed = 1")
+    (package / "lazy.py").write_text("from mjx_balance import root  # a comment")
+    assert today() == before
+    for file in (package / "lazy.py", scene):
+        file.write_text(f"{file.read_text()}\ny = 2")
+        assert today() != before
+        before = today()
