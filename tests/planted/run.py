@@ -11,13 +11,19 @@ Every `*.toml` beside this file lists one-line bugs of one area:
 
 Each is planted in a copy of the working tree, and the tests are run there until the first
 fails. A bug is caught if a test fails or the run hangs; `make bugs` prints the survivors.
+The libraries are imported once, and every run is a fork.
 
-    python tests/planted/run.py [--only AREA ...] [--write benchmarks/README.md]
+    python tests/planted/run.py [--only AREA ...] [--jobs 2] [--write benchmarks/README.md]
 """
 
 import argparse
+import contextlib
+import functools
+import importlib
+import multiprocessing
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -25,6 +31,8 @@ import time
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
+
+import pytest
 
 REPO = Path(__file__).resolve().parents[2]
 TIMEOUT = 600.0
@@ -63,32 +71,74 @@ def copy_tree(where: Path) -> None:
             shutil.copy2(REPO / name, where / name)
 
 
-def tests_pass(where: Path, tests: str) -> bool:
-    """Runs tests in a copy until the first fails."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests.split()]
-    environment = os.environ | {"PYTHONPATH": str(where), "PYTHONDONTWRITEBYTECODE": "1"}
+def set_folder(folder: str) -> None:
+    """Where this process, and what it starts, puts its files."""
+    tempfile.tempdir = os.environ["TMPDIR"] = folder
+
+
+@functools.cache
+def own_copy() -> Path:
+    """This process' copy of the tree."""
+    where = Path(tempfile.mkdtemp(prefix="planted-"))
+    copy_tree(where)
+    return where
+
+
+def tests_pass(tests: str) -> bool:
+    """Runs tests in this process' copy, in a fork, until the first fails."""
+    where = own_copy()
+    child = os.fork()
+    if not child:
+        run_pytest(where, tests)
+    deadline = time.monotonic() + TIMEOUT
+    while time.monotonic() < deadline:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            code = os.waitstatus_to_exitcode(status)
+            if code in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
+                raise SystemExit(f"pytest {tests} cannot run: exit code {code}")
+            return code == 0
+        time.sleep(0.05)
+    os.killpg(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return False
+
+
+def run_pytest(where: Path, tests: str) -> None:
+    """The child: becomes a pytest in `where`; does not return."""
+    code = 1
     try:
-        done = subprocess.run(
-            command, cwd=where, env=environment, capture_output=True, text=True, timeout=TIMEOUT
-        )
-    except subprocess.TimeoutExpired:
-        return False
-    if done.returncode not in (0, 1, 2):  # 1: a test failed, 2: the bug broke an import
-        raise SystemExit(f"pytest {tests} cannot run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
-    return done.returncode == 0
+        os.setsid()
+        os.chdir(where)
+        silence = os.open(os.devnull, os.O_WRONLY)
+        for stream in (1, 2):
+            os.dup2(silence, stream)
+        sys.path.insert(0, str(where))
+        os.environ |= {"PYTHONPATH": str(where), "PYTHONDONTWRITEBYTECODE": "1"}
+        sys.dont_write_bytecode = True
+        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests.split()])
+    finally:
+        os._exit(code)
 
 
-def caught(where: Path, bug: Bug) -> bool:
-    """Plants a bug in a copy, runs its tests, and takes it out again."""
-    path = where / bug.file
+def caught(bug: Bug) -> bool:
+    """Plants a bug in this process' copy, runs its tests, and takes it out again."""
+    path = own_copy() / bug.file
     whole = path.read_text()
     if whole.count(bug.old) != 1:
         raise SystemExit(f"{bug.file}: {bug.old!r} occurs {whole.count(bug.old)} times, not once")
     path.write_text(whole.replace(bug.old, bug.new))
     try:
-        return not tests_pass(where, bug.tests)
+        return not tests_pass(bug.tests)
     finally:
         path.write_text(whole)
+
+
+def preload() -> None:
+    """Imports what most tests import; none of it starts a thread or a device yet."""
+    for name in ("jax.numpy", "flax.linen", "optax", "orbax.checkpoint", "mujoco", "scipy.stats"):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
 
 
 def report(lines: list[str], page: Path | None) -> None:
@@ -106,18 +156,21 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", help="areas: names of the lists without .toml")
     parser.add_argument("--match", default="", help="only bugs whose file or lines hold this text")
     parser.add_argument("--write", type=Path, help="Markdown file with markers")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs at once")
     args = parser.parse_args()
     bugs = [bug for bug in listed(args.only) if args.match in f"{bug.file} {bug.old} {bug.new}"]
     survivors = []
     began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        where = Path(folder)
-        copy_tree(where)
-        for tests in sorted({bug.tests for bug in bugs}):
-            if not tests_pass(where, tests):
+    preload()
+    with (
+        tempfile.TemporaryDirectory(prefix="planted-") as folder,
+        multiprocessing.get_context("fork").Pool(args.jobs, set_folder, (folder,)) as pool,
+    ):
+        controls = sorted({bug.tests for bug in bugs})
+        for tests, passed in zip(controls, pool.imap(tests_pass, controls), strict=True):
+            if not passed:
                 raise SystemExit(f"{tests} fails without a bug; mend that first")
-        for bug in bugs:
-            ok = caught(where, bug)
+        for bug, ok in zip(bugs, pool.imap(caught, bugs), strict=True):
             if not ok:
                 survivors.append(bug)
             print("caught  " if ok else "SURVIVED", bug.file, "|", bug.new, flush=True)
