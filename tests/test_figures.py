@@ -75,7 +75,8 @@ def test_learning_curves_show_the_median_and_the_extremes_over_seeds() -> None:
 
 def test_learning_curves_join_runs_over_the_longest_of_them() -> None:
     long = [metrics_line(1_000 * k, [2.0 * k] * 6) for k in (1, 2, 3, 4)]
-    short = [metrics_line(2_000, [10.0] * 6), metrics_line(3_000, [10.0] * 6)]
+    # More lines, but not as long.
+    short = [metrics_line(n, [10.0] * 6) for n in (2_000, 2_250, 2_500, 2_750, 3_000)]
     figure = figures.learning_curves([short, long])
     # Before and after the short run there is the long one alone; where both are, their median.
     np.testing.assert_allclose(data(figure.axes[0]), [(1, 2), (2, 7), (3, 8), (4, 8)])
