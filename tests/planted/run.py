@@ -6,7 +6,7 @@ Every `*.toml` beside this file lists one-line bugs of one area:
     file = "mjx_balance/task/tilt.py"
     old = "since = clock - period * task.target_period"  # occurs once in the file
     new = "since = clock"
-    tests = "tests/test_tilt.py"  # what should notice: pytest's arguments
+    tests = "tests/task/test_tilt.py"  # what should notice: pytest's arguments
     equivalent = "..."  # only for a bug that changes nothing anyone could see: why
 
 Each is planted in a copy of the working tree, and the tests are run there until the first

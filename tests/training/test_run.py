@@ -18,7 +18,7 @@ from mjx_balance import load_policy
 from mjx_balance.run_folder import RunFolder
 from mjx_balance.training.checkpoints import saved_steps
 
-REPO = Path(__file__).parent.parent
+REPO = Path(__file__).parents[2]
 FLAGS = (
     "--preset smoke --num-env-steps 6144 --eval-scenarios 8 --eval-duration 10 "
     "--checkpoint-seconds 1"

@@ -17,7 +17,7 @@ from mjx_balance.report.measuring import measured
 from mjx_balance.report.reading import FOREIGN
 from mjx_balance.scene import Scene, load_scene
 
-SHIPPED = Path(__file__).parent.parent / "policies" / "best.safetensors"
+SHIPPED = Path(__file__).parents[2] / "policies" / "best.safetensors"
 NAMES = ("policy", "none", "pd-imu", "pd-attitude", "rate-oracle", "clairvoyant")
 MAPPED = Envelope([2.0, 3.0], [2.5], [[0.0], [0.5]], [[0.1], [3.0]], 4.0, 10.0, 2, 30.0, 7)
 
