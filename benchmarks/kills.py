@@ -69,6 +69,14 @@ def state_of(folder: RunFolder) -> str:
     return f"{logged} lines of metrics, {at}" + (", a policy" if folder.policy.is_file() else "")
 
 
+def ends(folder: RunFolder, cache: str) -> str:
+    """Resumes a killed run, unless all was written before the kill; the policy it ends in."""
+    finished = folder.evaluation.is_file()
+    if not finished and start(cache, "--resume", str(folder.path)).wait(LIMIT_S):
+        return "does not resume"
+    return load_policy(folder.policy).fingerprint
+
+
 def main() -> int:
     """Kills, resumes, compares; returns 1 if one run ended otherwise."""
     parser = argparse.ArgumentParser()
@@ -90,10 +98,7 @@ def main() -> int:
             after = drawn.uniform(0, length)
             process = start(cache, *FLAGS, "--run-dir", str(folder.path))
             how = state_of(folder) if killed(process, folder, after) else "had ended"
-            if how != "had ended" and start(cache, "--resume", str(folder.path)).wait(LIMIT_S):
-                got = "does not resume"
-            else:
-                got = load_policy(folder.policy).fingerprint
+            got = ends(folder, cache)
             same += got == wanted
             print(f"kill {k + 1:2} after {after:5.1f} s | {how} | {got}", flush=True)
     print(f"{same} of {args.kills} ended in the same policy")
