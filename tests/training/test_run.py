@@ -44,9 +44,11 @@ class Done(NamedTuple):
 
 
 def start(cache: Path, *flags: str) -> subprocess.Popen[str]:
+    environment = os.environ | {"MJX_BALANCE_CACHE": str(cache)}
+    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # JAX, imported here, has set it
     return subprocess.Popen(
         [sys.executable, str(REPO / "train.py"), *flags],
-        env=os.environ | {"MJX_BALANCE_CACHE": str(cache)},
+        env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
