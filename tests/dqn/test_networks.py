@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_balance.dqn import heads
 from mjx_balance.dqn.networks import QNetwork
 
 KEY = jax.random.PRNGKey(0)
@@ -61,17 +62,39 @@ def test_three_factors_are_a_mixed_radix_number() -> None:
 def test_radial_values_by_hand() -> None:
     """No hidden layer, no input: the head's bias is V and mu."""
     network = QNetwork((), (3, 5), radial=True)
-    log_e_minus_1 = np.log(np.e - 1)  # softplus of it is 1
+    alpha, beta, kappa, delta = profile = np.asarray((2.0, 0.5, 3.0, 0.7))
     params = {
         "head": {"kernel": np.zeros((4, 3)), "bias": np.asarray((2.0, 0.5, -0.5))},
-        "profile": np.full(4, log_e_minus_1),
+        "profile": np.log(np.exp(profile) - 1),  # softplus makes them what they are
         "stretch": np.log(np.asarray((2.0, 1.0))),
     }
     values = np.asarray(network.apply({"params": params}, jnp.zeros(2))).reshape(3, 5)
     for i, x in enumerate((-1.0, 0.0, 1.0)):
         for j, y in enumerate((-1.0, -0.5, 0.0, 0.5, 1.0)):
-            z = np.sqrt(1 + (2 * (x - 0.5)) ** 2 + (y + 0.5) ** 2)
-            assert values[i, j] == pytest.approx(2 + np.exp(-z) - z, abs=1e-5)
+            z = np.sqrt(delta**2 + (2 * (x - 0.5)) ** 2 + (y + 0.5) ** 2)
+            expected = 2 + alpha * np.exp(-beta * z) - kappa * z
+            assert values[i, j] == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_heads_give_numpy_and_jax_the_same(batch: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(3)
+    branches, out = rng.normal(size=(*batch, 7)), rng.normal(size=(*batch, 3))
+    rest = rng.normal(size=4), rng.normal(size=2), heads.points((3, 4))
+    plain = heads.added_up(branches, (3, 4)), heads.radial(out, *rest)
+    traced = heads.added_up(jnp.asarray(branches), (3, 4)), heads.radial(jnp.asarray(out), *rest)
+    for a, b in zip(plain, traced, strict=True):
+        assert type(a) is np.ndarray
+        assert a.shape == (*batch, 12)
+        np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5)
+
+
+def test_points_of_the_radial_head_follow_the_index() -> None:
+    """Action 4 i + j of (3, 4) stands at i of -1, 0, 1 and j of -1, -1/3, 1/3, 1."""
+    points = heads.points((3, 4))
+    assert points.dtype == np.float32
+    np.testing.assert_allclose(points[4 * 2 + 1], (1, -1 / 3), rtol=1e-6)
+    np.testing.assert_allclose(points[3], (-1, 1))
 
 
 def test_best_radial_action_is_the_nearest_to_mu() -> None:

@@ -35,6 +35,8 @@ def test_moments_are_those_of_all_observations_the_late_ones_weighing_more() -> 
     np.testing.assert_allclose(seen.mean, mean, rtol=1e-4)
     np.testing.assert_allclose(seen.covariance, square - np.outer(mean, mean), rtol=1e-3, atol=1e-3)
     assert float(seen.batches) == 6
+    damped = seen.covariance + FLOOR * np.eye(3)
+    np.testing.assert_allclose(seen.matrix @ damped @ seen.matrix, np.eye(3), atol=1e-3)
 
 
 def test_the_first_batch_replaces_what_there_was_before_any() -> None:

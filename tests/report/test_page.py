@@ -341,6 +341,10 @@ def test_the_seeds_of_alike_runs_are_put_together(config: Config) -> None:
     assert table[1] == ["paper", "3", "3 of 24", *three * 3]
     assert table[2] == ["corner", "3", "3 of 24", *["1.233 (1.100-1.400)", "1.400"] * 3]
     assert page.seeds_table(first, [first, other]) is None, "one seed needs no statistics"
+    lost = run_of("e", None, 0.1, 0.3)
+    shown = page.seeds_table(lost, [first, lost])
+    assert shown is not None
+    assert shown["rows"][0][1][0] == "2", "without its config a run stands alone"
     more.results[0].pop("corner")
     shown = page.seeds_table(first, [first, more])
     assert shown is not None
@@ -433,9 +437,9 @@ def test_a_folder_with_somebody_elses_config_is_refused(
 def test_the_command_gives_every_field_that_the_preset_does_not() -> None:
     best = preset("best")
     dqn = dataclasses.replace(best.dqn, gamma=0.77, mirror=False, hidden_sizes=(8, 9))
-    command = page.train_command(dataclasses.replace(best, dqn=dqn, num_envs=64))
+    command = page.train_command(dataclasses.replace(best, dqn=dqn, num_envs=64, seed=5))
     assert command == (
-        "mjx-balance train --preset best --seed 0 --num-envs 64 --gamma 0.77 --hidden-sizes 8 9 "
+        "mjx-balance train --preset best --seed 5 --num-envs 64 --gamma 0.77 --hidden-sizes 8 9 "
         "--no-mirror"
     )
 
