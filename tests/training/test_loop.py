@@ -1,9 +1,11 @@
 """The loop of a run around a stub program: what is logged, saved, stopped and resumed."""
 
+import dataclasses
 import io
 import itertools
 import json
 import os
+import shutil
 import signal
 import struct
 import threading
@@ -24,7 +26,9 @@ from mjx_balance.config import PRESETS, Config, TaskConfig
 from mjx_balance.display import Display
 from mjx_balance.run_folder import RunFolder
 from mjx_balance.training import checkpoints, loop
+from mjx_balance.training import run as run_module
 from mjx_balance.training.loop import Interrupts, Plan, learn, make_plan, measured
+from mjx_balance.training.program_cache import program_key
 
 PLAN = Plan(
     num_envs=4,
@@ -384,3 +388,58 @@ def test_seeds_count_their_decisions_together(
     lines = logged(folder)
     assert [line["env_steps"] for line in lines] == [20, 40, 60, 80, 100]
     assert lines[0]["seeds"]["loss"] == [0.25, 0.25]
+
+
+class Learner:
+    """Of runs of 64 envs, 16 decisions a call; its state says where it began."""
+
+    def __init__(self) -> None:
+        self.seeds: list[int] = []
+
+    def init(self, seed: int) -> State:
+        self.seeds.append(seed)
+        return start()
+
+    def train_program(self, iterations: int) -> Callable[[Any], Any]:
+        assert iterations == 16
+
+        def program(state: State) -> Any:
+            after, raw = step(state)
+            return after._replace(env_steps=state.env_steps + 64 * iterations), raw
+
+        return program
+
+
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Keys of the programs that were compiled."""
+    keys: list[str] = []
+
+    def compile_program(program: Any, state: Any, key: str, say: Any) -> Any:
+        keys.append(key)
+        return program
+
+    monkeypatch.setattr(run_module.program_cache, "compile_program", compile_program)
+    return keys
+
+
+def test_a_run_begins_at_its_newest_checkpoint(
+    folder: RunFolder, display: Display, stop: Interrupts, compiled: list[str]
+) -> None:
+    sized = dataclasses.replace(PRESETS["smoke"], num_env_steps=4_096, num_devices=1, seed=5)
+    learner: Any = Learner()
+
+    def go_on() -> Any:
+        return run_module._learn(sized, learner, folder, display, stop)[0]
+
+    third = State(jnp.int32(3_072), jnp.int32(9), jnp.float32(100))
+    checkpoints.save(folder.checkpoints, 1_024, start())
+    checkpoints.save(folder.checkpoints, 3_072, third)
+    assert float(go_on().weights) == 201  # one call from the newest, 2 * 100 + 1
+    assert learner.seeds == [5]
+    assert compiled == [program_key(sized, 16, "mjx_balance.training.devices")]
+    assert "resuming at 3,072 decisions" in display.console.file.getvalue()  # pyright: ignore
+    assert float(go_on().weights) == 201
+    assert len(compiled) == 1, "a complete run needs no program"
+    shutil.rmtree(folder.checkpoints)
+    assert float(go_on().weights) == 15  # four calls from nothing
