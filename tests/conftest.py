@@ -18,6 +18,20 @@ from mjx_balance.scene import Scene, load_scene
 jax.config.update("jax_num_cpu_devices", 2)
 
 
+SLOW = ("test_learning", "test_run", "test_env_randomization", "test_engines", "test_env", "dqn")
+"""Files and folders that begin first, so that the last of several processes is not left alone."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the slow files first."""
+
+    def rank(item: pytest.Item) -> int:
+        names = (item.path.stem, item.path.parent.name)
+        return next((k for k, name in enumerate(SLOW) if name in names), len(SLOW))
+
+    items.sort(key=rank)
+
+
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Where everything can be installed, a skipped test has not passed."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")

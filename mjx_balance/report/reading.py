@@ -17,7 +17,7 @@ from mjx_balance.report.figures import CURVES
 from mjx_balance.run_folder import RunFolder
 from mjx_balance.statistics import TILTS
 
-JSON_BYTES = 2 * 2**20
+JSON_BYTES = 2**20
 """Longest JSON file that is read; a run's own take some kilobytes."""
 METRICS_BYTES = 8 * 2**20
 """So much of metrics.jsonl is read."""

