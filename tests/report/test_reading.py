@@ -62,7 +62,7 @@ GOOD_LINE = json.dumps(metrics_line(0, 1))
         ("evaluation.json", '{"paper": 1}', "paper is 1; it must be a JSON object"),
         ("evaluation.json", "[" * 100_000, "evaluation.json cannot be used: it is nested too deep"),
         ("evaluation.json", "9" * 5_000, "evaluation.json cannot be used: it is no JSON: Exceeds"),
-        ("evaluation.json", " " * (2**21 + 1), "it is 2.0 MiB long; at most 2 MiB are read"),
+        ("evaluation.json", " " * (2**21 + 1), "it is 2.0 MiB long; at most 1 MiB are read"),
         ("evaluation.json", b"\xff\xfe\x00{", "evaluation.json cannot be used: it is no JSON"),
         ("evaluation.json", '{"\\u001b[2J\\ud800": 1}', "cannot be used: ?[2J? is 1; it must"),
         (
