@@ -10,7 +10,7 @@ seed axis and the iteration is vmapped over it.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -131,15 +131,20 @@ class Learner:
 
     def init(self, seed: int) -> TrainState:
         """Builds the state of a new run, or of runs `seed`, `seed + 1`, ..., on its devices."""
-        program = jax.shard_map(
-            self._each_seed(self.initial),
-            mesh=self.mesh,
-            in_specs=REPLICATED,
-            out_specs=self.specs,
-            check_vma=False,
-        )
         keys = jax.vmap(jax.random.PRNGKey)(seed + jnp.arange(self.num_seeds))
-        return jax.jit(program)(keys if self.num_seeds > 1 else keys[0])
+        return self._init_program(keys if self.num_seeds > 1 else keys[0])
+
+    @cached_property
+    def _init_program(self) -> Callable[[jax.Array], TrainState]:
+        return jax.jit(
+            jax.shard_map(
+                self._each_seed(self.initial),
+                mesh=self.mesh,
+                in_specs=REPLICATED,
+                out_specs=self.specs,
+                check_vma=False,
+            )
+        )
 
     def train_program(self, iterations: int) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
         """The jitted training program: state -> (state, metrics), the state donated.

@@ -119,7 +119,7 @@ def stepped(env: Env, obs: list[list[float]], action: list[int]) -> Any:
         return collect(env, state, jnp.asarray(action, jnp.int32), key)
 
     keys = jnp.stack([jax.random.PRNGKey(1)] * 2)
-    return jax.device_get(jax.vmap(one, axis_name=AXIS)(keys))
+    return jax.device_get(jax.jit(jax.vmap(one, axis_name=AXIS))(keys))
 
 
 def test_a_diverged_env_is_reset_and_its_row_is_another_envs() -> None:
