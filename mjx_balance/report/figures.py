@@ -137,12 +137,12 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
     return figure
 
 
-def _seed_curves(run: list[dict[str, Any]], name: str) -> list[list[float]]:
-    """One curve per seed where a run has them, else one."""
+def _seed_curves(run: list[dict[str, Any]], name: str) -> np.ndarray:
+    """One curve per seed where a run has them, else one; NaN where there was nothing to log."""
     short = name.removeprefix("train/")
     if run and short in run[0].get("seeds", {}):
-        return [list(curve) for curve in zip(*(m["seeds"][short] for m in run), strict=True)]
-    return [[m[name] for m in run]]
+        return np.asarray([m["seeds"][short] for m in run], float).T
+    return np.asarray([[m.get(name) for m in run]], float)
 
 
 @styled

@@ -228,12 +228,13 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
         raise ReportError(
             f"env_steps is {line['env_steps']}; it must be more than in the line before"
         )
+    found.setdefault("train/loss", math.nan)  # before the first update there is none
     line |= {name: _logged(found[name], name) for name, _, _ in CURVES}
     seeds = section(found.get("seeds", {}), "seeds")
     if seeds:
         short = [name.removeprefix("train/") for name, _, _ in CURVES]
         line["seeds"] = {
-            name: [_logged(value, name) for value in series(seeds[name], name)]
+            name: [_logged(math.nan if x is None else x, name) for x in series(seeds[name], name)]
             for name in short
             if name in seeds
         }
@@ -250,7 +251,7 @@ def _counts(line: dict[str, Any]) -> dict[str, int]:
 
 
 def _logged(value: Any, name: str) -> float:
-    """A metric; none of a diverged training is shown as a gap."""
+    """A metric; where there was none, or a training diverged, there is a gap."""
     if isinstance(value, float) and not math.isfinite(value):
         return math.nan
     return number(value, name)

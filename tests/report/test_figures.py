@@ -92,6 +92,19 @@ def test_learning_curves_leave_out_what_is_no_number_or_no_loss_yet() -> None:
     assert figure.axes[2].get_ylim()[0] < -1, "a negative reward can be seen"
 
 
+def test_a_run_whose_first_lines_have_no_loss_yet_is_drawn() -> None:
+    """No update has been made, as in preset `paper`: the line has no loss, a seed's is null."""
+    lines = [metrics_line(1_000 * k, [float(k)] * 6) for k in (1, 2, 3)]
+    del lines[0]["train/loss"], lines[1]["train/loss"]
+    figure = figures.learning_curves([lines])
+    np.testing.assert_allclose(data(figure.axes[3]), [(3, 3)])
+    np.testing.assert_allclose(data(figure.axes[0]), [(1, 1), (2, 2), (3, 3)])
+    lines = [metrics_line(1_000 * k, [9.0] * 6, loss=[1.0 * k, 3.0 * k]) for k in (1, 2)]
+    lines[0]["seeds"]["loss"][1] = None
+    figure = figures.learning_curves([lines])
+    np.testing.assert_allclose(data(figure.axes[3]), [(1, 1), (2, 4)])
+
+
 def test_reward_figure_is_equation_4_and_our_figure_5(config: Config) -> None:
     task = dataclasses.replace(config.task, reward_toward=0.8, reward_toward_scale=1.6)
     left, right = figures.reward_figure(task).axes

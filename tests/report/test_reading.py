@@ -337,3 +337,15 @@ def test_a_flood_that_is_a_run_is_read_soon_and_in_little_memory(tmp_path: Path)
     assert time.process_time() - began < 1
     assert len(run.metrics) > 8_000
     assert "its first 8 MiB are shown" in "".join(run.missing)
+
+
+def test_a_line_before_the_first_update_has_no_loss(tmp_path: Path) -> None:
+    lines = [metrics_line(k, 2) for k in range(3)]
+    del lines[0]["train/loss"]
+    lines[0]["seeds"] = {name: [0.5, 0.5] for name in lines[0]["seeds"]} | {"loss": [None, None]}
+    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(x)}\n" for x in lines))
+    run = reading.read_run(tmp_path)
+    assert len(run.metrics) == 3
+    assert np.isnan(run.metrics[0]["train/loss"])
+    assert np.isnan(run.metrics[0]["seeds"]["loss"]).all()
+    assert not any("metrics" in sentence for sentence in run.missing)
