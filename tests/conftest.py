@@ -18,12 +18,17 @@ from mjx_balance.scene import Scene, load_scene
 jax.config.update("jax_num_cpu_devices", 2)
 
 
-SLOW = ("test_learning", "test_run", "test_env_randomization", "test_engines", "test_env", "dqn")
+FLEET = ("test_engines", "test_env", "test_env_randomization", "test_stagger")
+"""Files that share the fixture `fleet`, which takes a minute to compile."""
+SLOW = ("test_run", "test_learning", *FLEET, "dqn")
 """Files and folders that begin first, so that the last of several processes is not left alone."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts the slow files first."""
+    """Tells pytest-xdist which tests belong to one process; puts the slow ones first."""
+    for item in items:
+        group = "fleet" if item.path.stem in FLEET else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
 
     def rank(item: pytest.Item) -> int:
         names = (item.path.stem, item.path.parent.name)

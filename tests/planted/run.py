@@ -116,7 +116,7 @@ def run_pytest(where: Path, tests: str) -> None:
         sys.path.insert(0, str(where))
         os.environ |= {"PYTHONPATH": str(where), "PYTHONDONTWRITEBYTECODE": "1"}
         sys.dont_write_bytecode = True
-        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *tests.split()])
+        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests.split()])
     finally:
         os._exit(code)
 
