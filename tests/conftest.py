@@ -24,6 +24,7 @@ SLOW = ("test_run", "test_learning", *FLEET, "dqn")
 """Files and folders that begin first, so that the last of several processes is not left alone."""
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tells pytest-xdist which tests belong to one process; puts the slow ones first."""
     for item in items:
