@@ -2,6 +2,7 @@
 
 import os
 import types
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,18 +25,27 @@ SLOW = ("test_run", "test_learning", *FLEET, "dqn")
 """Files and folders that begin first, so that the last of several processes is not left alone."""
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tells pytest-xdist which tests belong to one process; puts the slow ones first."""
-    for item in items:
-        group = "fleet" if item.path.stem in FLEET else str(item.path)
-        item.add_marker(pytest.mark.xdist_group(group))
+    """Puts the slow files first."""
 
     def rank(item: pytest.Item) -> int:
         names = (item.path.stem, item.path.parent.name)
         return next((k for k, name in enumerate(SLOW) if name in names), len(SLOW))
 
     items.sort(key=rank)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Keeps a file's tests, and those of all files that share a fixture, in one process."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.split("::", 1)[0]
+            return "fleet" if Path(file).stem in FLEET else file
+
+    return ByFile(config, log)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
