@@ -221,13 +221,13 @@ class Config:
     seed: int = bounded(0, least=0)
     """Seed of everything random."""
     num_envs: int | None = bounded(None, least=1)
-    """Boards simulated at once; none: sized to the device."""
+    """Envs simulated at once; none: sized to the device."""
     num_seeds: int = bounded(1, least=1)
     """Runs trained at once in one program, with seeds `seed`, `seed + 1`, ..."""
     num_env_steps: int = bounded(200_000, least=1)
-    """Decisions of a run, over all boards (paper 4: about 200k)."""
+    """Decisions of a run, over all envs (paper 4: about 200k)."""
     num_devices: int | None = bounded(None, least=1)
-    """JAX devices to spread the boards over; none: one per CPU core, or all accelerators."""
+    """JAX devices to spread the envs over; none: one per CPU core, or all accelerators."""
     log_every: int = bounded(2_048, least=1)
     """Env steps between two lines of metrics."""
     checkpoint_seconds: float = bounded(45.0, above=0)
