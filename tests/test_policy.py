@@ -128,6 +128,18 @@ def test_file_says_what_it_needs_to_run(path: Path) -> None:
     assert manifest["versions"]["mujoco"]
 
 
+def test_manifest_gives_times_and_offsets_of_the_preset_best() -> None:
+    """Means over 5 samples of 4 ms, legs that move for the first 10% of 0.2 s."""
+    manifest = make_manifest(preset("best"), "0" * 16, {})
+    observation = manifest["observation"]
+    assert observation["imu_mean_samples"] == 5
+    assert (observation["imu_lag_s"], observation["height_offset_m"]) == (0.004, 0.35)
+    assert len(observation["names"]) == len(observation["scale"]) == 136
+    assert manifest["actions"]["ramp_s"] == pytest.approx(0.02)
+    assert manifest["network"] == {"hidden_sizes": [64, 64], "factors": [21, 21], "radial": True}
+    assert manifest["robot"]["legs"] == ["LF", "RF", "LH", "RH"]
+
+
 def test_loaded_policy_equals_the_saved_one(tmp_path: Path) -> None:
     manifest = make_manifest(small_config("joint"), "0" * 16, {})
     saved = save_policy(tmp_path / "p", random_params("joint"), manifest)
@@ -181,6 +193,10 @@ def test_weights_without_a_manifest_are_refused(path: Path) -> None:
         ),
         (lambda w, m: w["hidden_1/kernel"].fill(np.nan), "weight hidden_1/kernel .* not finite"),
         (lambda w, m: w["head/bias"].fill(np.inf), "weight head/bias .* not finite"),
+        (
+            lambda w, m: w["head/kernel"].reshape(-1)[7:8].fill(np.nan),
+            "weight head/kernel .* not finite",
+        ),
         (lambda w, m: w.pop("head/kernel"), "weight head/kernel is missing"),
         (lambda w, m: m.update(version=99), "version is 99; this release reads 3"),
         (lambda w, m: m.update(format="onnx"), "format is 'onnx'"),
@@ -227,6 +243,14 @@ def test_senseless_manifest_is_refused(path: Path, spoil: Callable[[Manifest], o
     safetensors.numpy.save_file(weights, path, metadata=metadata)
     with pytest.raises(PolicyError, match="cannot be used"):
         load_policy(path)
+
+
+def test_weights_of_half_the_precision_are_refused(path: Path) -> None:
+    """A policy made in memory, as training does, is no less checked than a file."""
+    weights = safetensors.numpy.load_file(path)
+    weights["head/bias"] = weights["head/bias"].astype(np.float16)
+    with pytest.raises(PolicyError, match="head/bias is float16 of shape .* must be float32"):
+        Policy(load_policy(path).manifest, weights)
 
 
 def test_a_type_that_numpy_does_not_know_is_refused(path: Path) -> None:
