@@ -249,7 +249,7 @@ def test_weights_of_half_the_precision_are_refused(path: Path) -> None:
     """A policy made in memory, as training does, is no less checked than a file."""
     weights = safetensors.numpy.load_file(path)
     weights["head/bias"] = weights["head/bias"].astype(np.float16)
-    with pytest.raises(PolicyError, match="head/bias is float16 of shape .* must be float32"):
+    with pytest.raises(PolicyError, match=r"head/bias is float16 of shape .* must be float32"):
         Policy(load_policy(path).manifest, weights)
 
 
