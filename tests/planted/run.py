@@ -141,13 +141,29 @@ def preload() -> None:
             importlib.import_module(name)
 
 
-def report(lines: list[str], page: Path | None) -> None:
-    """Prints lines, and puts them between the markers of a Markdown file."""
-    print("\n".join(lines))
-    if page is not None:
-        before, rest = page.read_text().split(MARKERS[0])
-        after = rest.split(MARKERS[1])[1]
-        page.write_text("\n\n".join((before + MARKERS[0], *lines, MARKERS[1] + after)))
+def rows(bugs: list[Bug], survivors: list[Bug]) -> dict[str, str]:
+    """A row of the table for each area."""
+    found = {}
+    for area in sorted({bug.area for bug in bugs}):
+        of = [bug for bug in bugs if bug.area == area]
+        left = [bug for bug in survivors if bug.area == area]
+        said = [f"`{bug.new}` for `{bug.old}` ({bug.equivalent or 'not excused'})" for bug in left]
+        caught = len(of) - len(left)
+        found[area] = f"| `{area}` | {caught} of {len(of)} | {'; '.join(said) or '-'} |"
+    return found
+
+
+def write(found: dict[str, str], page: Path) -> None:
+    """Puts rows into the table between the markers of a Markdown file; other areas' rows stay."""
+    before, rest = page.read_text().split(MARKERS[0])
+    table, after = rest.split(MARKERS[1])
+    old = {line.split("`")[1]: line for line in table.splitlines() if line.startswith("| `")}
+    lines = [
+        "| list | caught | survivors |",
+        "|---|---|---|",
+        *dict(sorted((old | found).items())).values(),
+    ]
+    page.write_text("\n\n".join((before + MARKERS[0], "\n".join(lines), MARKERS[1] + after)))
 
 
 def main() -> int:
@@ -175,13 +191,12 @@ def main() -> int:
                 survivors.append(bug)
             print("caught  " if ok else "SURVIVED", bug.file, "|", bug.new, flush=True)
     minutes = (time.perf_counter() - began) / 60
-    unexcused = [bug for bug in survivors if bug.equivalent is None]
-    lines = [f"{len(bugs) - len(survivors)} of {len(bugs)} caught, in {minutes:.0f} min."]
-    for bug in survivors:
-        why = bug.equivalent or "not excused"
-        lines.append(f"Survived: `{bug.file}`, `{bug.new}` instead of `{bug.old}` ({why})")
-    report(lines, args.write)
-    return 1 if unexcused else 0
+    print(f"{len(bugs) - len(survivors)} of {len(bugs)} caught, in {minutes:.0f} min.")
+    found = rows(bugs, survivors)
+    print("\n".join(found.values()))
+    if args.write:
+        write(found, args.write)
+    return int(any(bug.equivalent is None for bug in survivors))
 
 
 if __name__ == "__main__":
