@@ -142,7 +142,8 @@ class ImuPD(AttitudePD):
 
     The filter integrates the gyro and leans toward the accelerometer's tilt with a time
     constant (Mahony et al. 2008, https://hal.science/hal-00488376, section III, with
-    fixed gain and no bias): angle += dt * gyro + dt / (tau + dt) * (tilt_accel - angle).
+    fixed gain and no bias): angle += dt * gyro, then
+    angle += dt / (tau + dt) * (tilt_accel - angle).
     """
 
     def __init__(

@@ -22,7 +22,7 @@ else:
     import fcntl
 
 READ_AT_MOST = 2**20
-"""Bytes of a config or a provenance; a file with more is neither."""
+"""Bytes of a JSON file of a run; those of ours take some kilobytes."""
 SAID_AT_MOST = 300
 """Characters of another's error that a message repeats."""
 
@@ -180,24 +180,34 @@ def read_run_config(path: Path) -> Config:
     if folder.evaluation.is_file():
         raise RunFolderError(f"the run in {path} is finished; start a new one with --run-dir")
     try:
-        return check(from_dict(Config, _read_json(folder.config)))
-    # A config of the wrong types can fail anywhere.
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        return check(from_dict(Config, read_json(folder.config)))
+    except ValueError as error:
         raise RunFolderError(f"{folder.config} cannot be used: {_brief(error)}") from error
 
 
-def _read_json(file: Path) -> Any:
-    """Reads a small JSON file; raises ValueError for whatever is wrong with it."""
+def read_json(file: Path) -> Any:
+    """Reads a small JSON file of a run; raises ValueError for whatever is wrong with it."""
     try:
         with file.open("rb") as opened:
             content = opened.read(READ_AT_MOST + 1)
         if len(content) > READ_AT_MOST:
-            raise ValueError(f"it is longer than {READ_AT_MOST} bytes")
-        return json.loads(content)
-    except RecursionError as error:
-        raise ValueError("it is nested too deeply") from error
+            raise ValueError(
+                f"it is {file.stat().st_size / 2**20:.1f} MiB long; at most "
+                f"{READ_AT_MOST / 2**20:.0f} MiB are read"
+            )
+        return parse_json(content)
     except OSError as error:
         raise ValueError(str(error.strerror)) from error
+
+
+def parse_json(content: bytes) -> Any:
+    """Parses what a file holds; raises ValueError if it is no JSON, or nested too deep."""
+    try:
+        return json.loads(content)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
+    except ValueError as error:  # also text that is not UTF-8, and numbers of 5,000 digits
+        raise ValueError(f"it is no JSON: {error}") from error
 
 
 def _brief(error: Exception) -> str:
@@ -236,7 +246,7 @@ def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
     """
     file = RunFolder(path).provenance
     try:
-        saved = _read_json(file)
+        saved = read_json(file)
         versions = dict(saved["versions"])
     except (LookupError, TypeError, ValueError) as error:
         raise RunFolderError(

@@ -51,7 +51,7 @@ JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
 
 
 def module_name(path: Path) -> str:
-    """`task/legs.py` -> `task.legs`, `task/__init__.py` -> `task`, `__init__.py` -> ``."""
+    """`task/tilt.py` -> `task.tilt`, `task/__init__.py` -> `task`, `__init__.py` -> ``."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(part for part in parts if part != "__init__")
 

@@ -27,11 +27,11 @@ from mjx_balance.report.reading import (
     ReportError,
     count,
     number,
-    read_json,
     section,
     series,
     suite_result,
 )
+from mjx_balance.run_folder import read_json
 from mjx_balance.scene import Scene
 from mjx_balance.suites import HEADLINE, SEEDS
 

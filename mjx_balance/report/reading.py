@@ -4,7 +4,6 @@ Every value that the report uses is checked here, and nothing else of a file is 
 """
 
 import dataclasses
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -14,11 +13,9 @@ from typing import Any
 from mjx_balance.config import Config, check, from_dict
 from mjx_balance.policy import Policy, load_policy
 from mjx_balance.report.figures import CURVES
-from mjx_balance.run_folder import RunFolder
+from mjx_balance.run_folder import RunFolder, parse_json, read_json
 from mjx_balance.statistics import TILTS
 
-JSON_BYTES = 2**20
-"""Longest JSON file that is read; a run's own take some kilobytes."""
 METRICS_BYTES = 8 * 2**20
 """So much of metrics.jsonl is read."""
 LINE_BYTES = 2**18
@@ -94,38 +91,11 @@ def read_run(path: Path) -> Run:
 
 def why(error: BaseException) -> str:
     """The reason that an error gives: one short line, with nothing that moves a cursor."""
-    if isinstance(error, RecursionError):
-        return "it is nested too deep"
     reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
     cut = len(reason) > SENTENCE
     reason = " ".join(reason[:SENTENCE].split()) or type(error).__name__
     reason = "".join(letter if letter.isprintable() else "?" for letter in reason)
     return f"{reason} ..." if cut else reason
-
-
-def read_json(file: Path) -> Any:
-    """Parses a JSON file.
-
-    Raises:
-      ReportError: if it is too long or no JSON.
-      RecursionError: if it is nested too deep.
-      OSError: if it cannot be read.
-    """
-    with file.open("rb") as opened:
-        text = opened.read(JSON_BYTES + 1)
-    if len(text) > JSON_BYTES:
-        raise ReportError(
-            f"it is {file.stat().st_size / 2**20:.1f} MiB long; at most {JSON_BYTES / 2**20:.0f} "
-            "MiB are read"
-        )
-    return _parsed(text)
-
-
-def _parsed(text: bytes) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError as error:  # also text that is not UTF-8, and numbers of 5,000 digits
-        raise ReportError(f"it is no JSON: {error}") from error
 
 
 def section(value: Any, name: str = "it") -> dict[str, Any]:
@@ -222,7 +192,7 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
     """What the learning curves need of a line that follows those `before` it."""
     if len(text) > LINE_BYTES:
         raise ReportError(f"it is longer than {LINE_BYTES:,} bytes")
-    found = section(_parsed(text))
+    found = section(parse_json(text))
     line: dict[str, Any] = {"env_steps": count(found["env_steps"], "env_steps")}
     if before and line["env_steps"] <= before[-1]["env_steps"]:
         raise ReportError(

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mjx_balance import run_folder
 from mjx_balance.config import preset, to_dict
 from mjx_balance.report import page, reading
 from mjx_balance.report.reading import ReportError
@@ -311,7 +312,7 @@ UNITS = (b"[", b"[],", b"9", b"\n", b'{"a":', b"\xff", b'"', b"{}\n", b"1e9,")
 def test_a_flood_is_refused_soon_and_in_little_memory(
     tmp_path: Path, name: str, unit: bytes
 ) -> None:
-    for size in (reading.JSON_BYTES - 100, 16 * 2**20):
+    for size in (run_folder.READ_AT_MOST - 100, 16 * 2**20):
         flood = unit * (size // len(unit))
         if unit.endswith(b","):
             flood = b"[%s0]" % flood
