@@ -5,7 +5,23 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
 
+from mjx_balance.config import DQNConfig
 from mjx_balance.task.symmetry import Symmetries
+
+CONFIG = DQNConfig(
+    gamma=0.5,
+    learning_rate=3e-3,
+    learning_rate_end_share=0.1,
+    batch_size=32,
+    replay_ratio=8,
+    replay_capacity=512,
+    min_replay_size=16,
+    target_update_period=20,
+    epsilon_decay_steps=1_000,
+    epsilon_end=0.3,
+    hidden_sizes=(16,),
+)
+"""Learns the values of these environments in some hundred iterations."""
 
 
 class Probe(Env):

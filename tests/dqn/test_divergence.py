@@ -11,27 +11,13 @@ import probes
 import pytest
 from brax.envs.base import Env
 
-from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import replay
 from mjx_balance.dqn.collecting import collect
 from mjx_balance.dqn.devices import AXIS
 from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
 
-CONFIG = DQNConfig(
-    gamma=0.5,
-    learning_rate=3e-3,
-    learning_rate_end_share=0.1,
-    batch_size=32,
-    replay_ratio=8,
-    replay_capacity=512,
-    min_replay_size=16,
-    target_update_period=20,
-    epsilon_decay_steps=1_000,
-    epsilon_end=0.3,
-    hidden_sizes=(16,),
-    whiten_steps=1_600,
-)
+CONFIG = dataclasses.replace(probes.CONFIG, whiten_steps=1_600)
 ENVS, ITERATIONS = 8, 500
 
 

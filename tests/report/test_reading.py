@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from made_up import evaluation_result, metrics_line
 
 from mjx_balance import run_folder
 from mjx_balance.config import preset, to_dict
@@ -21,22 +22,6 @@ from mjx_balance.report import page, reading
 from mjx_balance.report.reading import ReportError
 
 HOSTILE = "<img src=x onerror=alert(1)>"
-
-
-def metrics_line(k: int, seeds: int) -> dict[str, Any]:
-    names = "tilt_deg falls_per_minute reward loss epsilon".split()
-    line: dict[str, Any] = {"env_steps": 1024 * (k + 1), "gradient_steps": k}
-    line |= {f"train/{name}": 1 / (k + 1) for name in names}
-    line |= {"perf/env_steps_per_second": 500.0, "perf/physics_steps_per_second": 25_000.0}
-    if seeds > 1:
-        values = [(n + 1) / (k + 1) for n in range(seeds)]
-        line["seeds"] = dict.fromkeys(("tilt_deg", "reward", "loss"), values)
-    return line
-
-
-def evaluation_result(suite: str, tilt: float) -> dict[str, Any]:
-    keys = ("mean", "rms", "p50", "p95", "p99", "max")
-    return {"suite": suite, "scenarios": 8, "falls": 1, "tilt_deg": dict.fromkeys(keys, tilt)}
 
 
 GOOD_LINE = json.dumps(metrics_line(0, 1))
