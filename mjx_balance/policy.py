@@ -62,7 +62,7 @@ class Policy:
         self.manifest = manifest
         self.scene_hash: str = manifest["scene_hash"]
         self.actions = action_table(self.config.task)
-        self.factors = action_factors(self.config)
+        self.factors = network_branches(self.config)
         self.radial = self.config.dqn.head == "radial"
         self.observation_size = len(manifest["observation"]["names"])
         hidden = self.config.dqn.hidden_sizes
@@ -172,7 +172,7 @@ def _check_weights(
             raise PolicyError(f"weight {name} holds values that are not finite numbers")
 
 
-def action_factors(config: Config) -> tuple[int, ...]:
+def network_branches(config: Config) -> tuple[int, ...]:
     """Output branches of the network: all actions at once, or roll and pitch apart."""
     levels = config.task.action_levels
     return (levels**ACTION_AXES,) if config.dqn.head == "joint" else (levels,) * ACTION_AXES
@@ -210,7 +210,7 @@ def _described(config: Config) -> dict[str, Any]:
         "robot": to_dict(robot),
         "network": {
             "hidden_sizes": list(config.dqn.hidden_sizes),
-            "factors": list(action_factors(config)),
+            "factors": list(network_branches(config)),
             "radial": config.dqn.head == "radial",
         },
         "observation": {

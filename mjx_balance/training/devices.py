@@ -12,7 +12,7 @@ from mjx_balance.config import Config, ConfigError, check
 from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.env import BalanceEnv
-from mjx_balance.policy import action_factors
+from mjx_balance.policy import network_branches
 from mjx_balance.training.program_cache import Say, enable_compilation_cache
 
 STATE_COPIES = 2
@@ -69,7 +69,7 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
     assert config.num_devices is not None
     return Learner(
         env,
-        QNetwork(config.dqn.hidden_sizes, action_factors(config), config.dqn.head == "radial"),
+        QNetwork(config.dqn.hidden_sizes, network_branches(config), config.dqn.head == "radial"),
         config.dqn,
         config.num_envs,
         config.num_env_steps,
