@@ -504,6 +504,22 @@ def test_noise_of_a_world_does_not_depend_on_its_neighbours(config: Config, scen
     np.testing.assert_allclose(watch_imu(scene, config, "noise", 3, 0), alone, atol=1e-9)
 
 
+def test_noise_of_a_world_does_not_depend_on_who_fell_before_it(
+    config: Config, scene: Scene
+) -> None:
+    """World 0 falls within 1.2 s or stands; world 1 sees the same samples for 2 s."""
+    seen: dict[int, list[np.ndarray]] = {LEFT_UP: [], STAND: []}
+    for action, samples in seen.items():
+
+        def act(view: View, action: int = action, samples: Any = samples) -> np.ndarray:
+            samples.append(view.imu[view.ids == 1][0])
+            return np.where(view.ids == 0, action, STAND)
+
+        fell = run_suite(scene, config, act, "noise", 2, 2.0, 0).fell
+        np.testing.assert_array_equal(fell, (action == LEFT_UP, False))
+    np.testing.assert_array_equal(seen[LEFT_UP], seen[STAND])
+
+
 def test_standing_still_on_a_level_board_stays_level(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "paper", 2, 4.0, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)

@@ -84,12 +84,31 @@ def own_copy() -> Path:
     return where
 
 
-def tests_pass(tests: str) -> bool:
-    """Runs tests in this process' copy, in a fork, until the first fails."""
+class Witness:
+    """A plugin of pytest that writes down which test failed."""
+
+    def __init__(self, file: Path):
+        """Writes to `file`."""
+        self.file = file
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Called by pytest after every phase of a test."""
+        if report.failed:
+            self.file.write_text(report.nodeid)
+
+
+def failing(tests: str) -> str | None:
+    """Runs tests in this process' copy, in a fork, until the first fails.
+
+    Returns:
+      What failed, or none if all passed.
+    """
     where = own_copy()
+    witness = where / "failed.txt"
+    witness.unlink(missing_ok=True)
     child = os.fork()
     if not child:
-        run_pytest(where, tests)
+        run_pytest(where, tests, witness)
     deadline = time.monotonic() + TIMEOUT
     while time.monotonic() < deadline:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -97,14 +116,16 @@ def tests_pass(tests: str) -> bool:
             code = os.waitstatus_to_exitcode(status)
             if code in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
                 raise SystemExit(f"pytest {tests} cannot run: exit code {code}")
-            return code == 0
+            if code == 0:
+                return None
+            return witness.read_text() if witness.is_file() else "the import"
         time.sleep(0.05)
     os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    return False
+    return "the time limit"
 
 
-def run_pytest(where: Path, tests: str) -> None:
+def run_pytest(where: Path, tests: str, witness: Path) -> None:
     """The child: becomes a pytest in `where`; does not return."""
     code = 1
     try:
@@ -116,20 +137,22 @@ def run_pytest(where: Path, tests: str) -> None:
         sys.path.insert(0, str(where))
         os.environ |= {"PYTHONPATH": str(where), "PYTHONDONTWRITEBYTECODE": "1"}
         sys.dont_write_bytecode = True
-        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests.split()])
+        code = pytest.main(
+            ["-x", "-q", "-p", "no:cacheprovider", *tests.split()], [Witness(witness)]
+        )
     finally:
         os._exit(code)
 
 
-def caught(bug: Bug) -> bool:
-    """Plants a bug in this process' copy, runs its tests, and takes it out again."""
+def caught(bug: Bug) -> str | None:
+    """Plants a bug in this process' copy, and takes it out again; returns what noticed it."""
     path = own_copy() / bug.file
     whole = path.read_text()
     if whole.count(bug.old) != 1:
         raise SystemExit(f"{bug.file}: {bug.old!r} occurs {whole.count(bug.old)} times, not once")
     path.write_text(whole.replace(bug.old, bug.new))
     try:
-        return not tests_pass(bug.tests)
+        return failing(bug.tests)
     finally:
         path.write_text(whole)
 
@@ -183,13 +206,14 @@ def main() -> int:
         multiprocessing.get_context("fork").Pool(args.jobs, set_folder, (folder,)) as pool,
     ):
         controls = sorted({bug.tests for bug in bugs})
-        for tests, passed in zip(controls, pool.imap(tests_pass, controls), strict=True):
-            if not passed:
-                raise SystemExit(f"{tests} fails without a bug; mend that first")
-        for bug, ok in zip(bugs, pool.imap(caught, bugs), strict=True):
-            if not ok:
+        for tests, failed in zip(controls, pool.imap(failing, controls), strict=True):
+            if failed:
+                raise SystemExit(f"{failed} of {tests} fails without a bug; mend that first")
+        for bug, by in zip(bugs, pool.imap(caught, bugs), strict=True):
+            if by is None:
                 survivors.append(bug)
-            print("caught  " if ok else "SURVIVED", bug.file, "|", bug.new, flush=True)
+            said = f"caught by {by}" if by else "SURVIVED"
+            print(f"{bug.file} | {bug.new.strip()} | {said}", flush=True)
     minutes = (time.perf_counter() - began) / 60
     print(f"{len(bugs) - len(survivors)} of {len(bugs)} caught, in {minutes:.0f} min.")
     found = rows(bugs, survivors)
