@@ -48,13 +48,13 @@ def tune(scenarios: int, duration: float, suite: str) -> None:
     scene = load_scene(config)
     for kind, grid in GRIDS.items():
         # From today's gains, so that a search that finds nothing better confirms them.
-        controller = kind(scene, config)
+        controller = kind(scene)
         chosen = {name: getattr(controller, name) for name in grid}
         scores: dict[tuple[float, ...], float] = {}
 
         def mean(trial: Mapping[str, float], seed: int, kind=kind) -> float:
-            controller = kind(scene, config, **trial)
-            rollout = run_suite(scene, config, controller, suite, scenarios, duration, seed)
+            controller = kind(scene, **trial)
+            rollout = run_suite(scene, controller, suite, scenarios, duration, seed)
             return float(rollout.tilt.mean())
 
         def score(trial: Mapping[str, float], mean=mean, scores=scores) -> float:
@@ -86,10 +86,8 @@ def leg_timing(scenarios: int, duration: float, page: Path) -> None:
         cells = [f"{ramp:.0%}" + (" (as shipped)" if task == default.task else "")]
         for name in TIMED:
             for suite in HEADLINE:
-                controller = make_controller(name, scene, config)
-                rollout = run_suite(
-                    scene, config, controller, suite, scenarios, duration, SEEDS.held_out
-                )
+                controller = make_controller(name, scene)
+                rollout = run_suite(scene, controller, suite, scenarios, duration, SEEDS.held_out)
                 tilt = summarize(rollout, suite, duration, SEEDS.held_out)["tilt_deg"]
                 cells.append(" / ".join(f"{tilt[x]:.3f}" for x in ("mean", "p95", "max")))
         rows.append(cells)

@@ -72,15 +72,13 @@ def main() -> None:
     args = parser.parse_args()
     policy = load_policy(args.policy)
     scene = evaluation.policy_scene(policy)
-    config = policy.config
-    drawn, _ = make_scenarios(config, "corner", args.scenarios, args.duration, 0)
+    drawn, _ = make_scenarios(policy.config, "corner", args.scenarios, args.duration, 0)
     print("| variant | falls | mean tilt deg | max deg | creep of the standing robots, cm |")
     print("|---|---|---|---|---|")
     trunk = scene.trunk_quat[0] - np.asarray((3, 2))
     for name, changes in VARIANTS.items():
         rollout = evaluation.roll_out(
             varied(scene, changes),
-            config,
             exploring(policy, 0.1, 0),
             drawn,
             args.duration,

@@ -87,7 +87,7 @@ def suite_result(
     scene, config = policy_scene(policy), policy.config
 
     def measure(bar: Any, count: int = scenarios) -> dict[str, Any]:
-        rollout = run_suite(scene, config, make(), suite, count, DURATION, SEEDS.held_out, bar)
+        rollout = run_suite(scene, make(), suite, count, DURATION, SEEDS.held_out, bar)
         firsts = {str(n): float(rollout.tilt[:n].mean()) for n in parts if n <= count}
         return summarize(rollout, suite, DURATION, SEEDS.held_out) | {"mean_of_first": firsts}
 
@@ -142,7 +142,7 @@ def main() -> None:
     args = parser.parse_args()
     policies = [load_policy(path) for path in args.policies]
     first = policies[0]
-    scene, config = policy_scene(first), first.config
+    scene = policy_scene(first)
     parts = (args.rest, args.others)
     networks: dict[str, list[dict[str, Any]]] = {}
     baselines: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in CONTROLLERS}
@@ -166,7 +166,7 @@ def main() -> None:
                 args.out,
                 name,
                 first,
-                lambda name=name: make_controller(name, scene, config),
+                lambda name=name: make_controller(name, scene),
                 suite,
                 usual if name == "pd-imu" else args.rest,
                 parts,
@@ -177,7 +177,6 @@ def main() -> None:
         def measure(bar: Any, policy: Policy = policy) -> dict[str, Any]:
             found = envelope(
                 scene,
-                config,
                 observing(policy),
                 ENVELOPE_SCENARIOS,
                 ENVELOPE_DURATION,

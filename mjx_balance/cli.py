@@ -139,17 +139,15 @@ def _evaluate(argv: list[str]) -> int:
             return _complain("name a policy file or --controller NAME, one of the two")
         if args.policy is not None:
             policy = load_policy(args.policy)
-            config, scene = policy.config, evaluation.policy_scene(policy)
+            scene = evaluation.policy_scene(policy)
             controller = evaluation.observing(policy)
         else:
             assert args.controller is not None
-            config = preset("default")
-            scene = load_scene(config)
-            controller = make_controller(args.controller, scene, config)
+            scene = load_scene(preset("default"))
+            controller = make_controller(args.controller, scene)
         with display.bar(f"evaluating, suite {args.suite}") as bar:
             rollout = evaluation.run_suite(
                 scene,
-                config,
                 controller,
                 args.suite,
                 args.scenarios,
@@ -164,7 +162,7 @@ def _evaluate(argv: list[str]) -> int:
         speed = result["physics_steps_per_second"]
         print(f"{speed:,.0f} physics steps per second")
         if args.video:
-            return _video(scene, config, controller, args)
+            return _video(scene, controller, args)
     except (PolicyError, evaluation.EvaluationError, SuiteError, ControllerError) as error:
         return _complain(str(error))
     except OSError as error:
@@ -174,16 +172,16 @@ def _evaluate(argv: list[str]) -> int:
     return 0
 
 
-def _video(scene, config: Config, controller, args: EvaluateArgs) -> int:
+def _video(scene, controller, args: EvaluateArgs) -> int:
     from mjx_balance import evaluation, render
 
     assert args.video is not None
     rollout = evaluation.run_suite(
-        scene, config, controller, args.suite, 1, args.duration, args.seed, record=True
+        scene, controller, args.suite, 1, args.duration, args.seed, record=True
     )
     assert rollout.qpos is not None
     try:
-        render.write(args.video, config, rollout.qpos[0])
+        render.write(args.video, scene.config, rollout.qpos[0])
     except render.RenderError as error:
         print(f"mjx-balance: no video written: {error}", file=sys.stderr)
         return 1

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.config import ACTION_AXES, Config
+from mjx_balance.config import ACTION_AXES
 from mjx_balance.scene import Scene
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.actions import nearest_action
@@ -66,9 +66,9 @@ class Response:
     """(2, HORIZON * sim_steps) share of it reached after each physics step."""
 
 
-def measure_response(scene: Scene, config: Config) -> Response:
+def measure_response(scene: Scene) -> Response:
     """Takes one action on each axis, on the level board, and watches the body."""
-    task, robot = config.task, scene.robot
+    task, robot = scene.config.task, scene.robot
     size = task.action_max / 2
     gains, courses = [], []
     level = tilt.Scenario(np.zeros((1, 2)), np.zeros(()), np.asarray(task.board_rate))
@@ -99,9 +99,9 @@ def attitude(scene: Scene, view: View) -> np.ndarray:
 class Stand:
     """Never moves."""
 
-    def __init__(self, scene: Scene, config: Config):
+    def __init__(self, scene: Scene):
         """Needs the action set only."""
-        self.action = nearest_action(config.task, np.zeros(ACTION_AXES))
+        self.action = nearest_action(scene.config.task, np.zeros(ACTION_AXES))
 
     def __call__(self, view: View) -> np.ndarray:
         """Returns action indices (n,)."""
@@ -111,24 +111,23 @@ class Stand:
 class AttitudePD:
     """Proportional and derivative control on the true attitude and angular rate."""
 
-    def __init__(self, scene: Scene, config: Config, proportional: float = 1.3, rate: float = 0.12):
+    def __init__(self, scene: Scene, proportional: float = 1.3, rate: float = 0.12):
         """Takes the gains.
 
         Args:
-          scene: addresses.
-          config: the task.
+          scene: task and addresses.
           proportional: share of the tilt undone by one decision (benchmarks/baselines.py).
           rate: time for which the present rate is undone beforehand, s (same).
         """
-        self.scene, self.config = scene, config
+        self.scene, self.task = scene, scene.config.task
         self.proportional, self.rate = proportional, rate
-        self.gain = measure_response(scene, config).gain
+        self.gain = measure_response(scene).gain
 
     def __call__(self, view: View) -> np.ndarray:
         """Returns action indices (n,)."""
         angle, speed = self.state(view)
         wanted = -(self.proportional * angle + self.rate * speed) / self.gain
-        return nearest_action(self.config.task, wanted)
+        return nearest_action(self.task, wanted)
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Roll and pitch (n, 2), deg, and their rates (n, 2), deg/s."""
@@ -149,14 +148,13 @@ class ImuPD(AttitudePD):
     def __init__(
         self,
         scene: Scene,
-        config: Config,
         proportional: float = 1.2,
         rate: float = 0.14,
         tau: float = 4.0,
         samples: int = 1,
     ):
         """Takes the gains; `tau` in s, and the gyro samples averaged for the rate."""
-        super().__init__(scene, config, proportional, rate)
+        super().__init__(scene, proportional, rate)
         self.tau, self.samples = tau, samples
         self.angle = np.zeros((0, ACTION_AXES))
 
@@ -168,7 +166,7 @@ class ImuPD(AttitudePD):
         lean = np.arctan2(accel[..., 1], accel[..., 2])
         nod = np.arctan2(-accel[..., 0], np.hypot(accel[..., 1], accel[..., 2]))
         by_gravity = np.stack((lean, nod), axis=-1)
-        dt = self.config.task.sim_dt
+        dt = self.task.sim_dt
         leak = dt / (self.tau + dt)
         weight = (1 - leak) ** np.arange(view.imu.shape[1])[::-1, None]
         steps = dt * (1 - leak) * gyro + leak * by_gravity
@@ -185,17 +183,16 @@ class Predictive:
     within the action limits, takes the first action that is still open and plans again.
     """
 
-    def __init__(self, scene: Scene, config: Config, forecast: Callable[..., np.ndarray]):
+    def __init__(self, scene: Scene, forecast: Callable[..., np.ndarray]):
         """Prepares the quadratic programme.
 
         Args:
-          scene: addresses.
-          config: the task.
+          scene: task and addresses.
           forecast: (task, scenario, now (n,), ahead (m,)) -> (n, m, 2) change of the
             board's angles, deg.
         """
-        self.scene, self.config, self.forecast = scene, config, forecast
-        response, steps = measure_response(scene, config), config.task.sim_steps
+        self.scene, self.task, self.forecast = scene, scene.config.task, forecast
+        response, steps = measure_response(scene), self.task.sim_steps
         self.gain = response.gain
         # effect[axis, j, t]: deg at step t per deg of action j
         effect = np.zeros((ACTION_AXES, HORIZON, HORIZON * steps))
@@ -210,7 +207,7 @@ class Predictive:
 
     def __call__(self, view: View) -> np.ndarray:
         """Returns action indices (n,)."""
-        task, n = self.config.task, len(view.ids)
+        task, n = self.task, len(view.ids)
         if view.decision == 0:
             self.chosen = np.zeros((2, view.ids.max() + 1, ACTION_AXES))
         older, newer = self.chosen[:, view.ids]
@@ -258,20 +255,20 @@ def as_it_will_be(task, scenario: tilt.Scenario, now: np.ndarray, ahead: np.ndar
     return angle[:, 1:] - angle[:, :1]
 
 
-CONTROLLERS: dict[str, Callable[[Scene, Config], Controller]] = {
+CONTROLLERS: dict[str, Callable[[Scene], Controller]] = {
     "none": Stand,
     "pd-imu": ImuPD,
     "pd-attitude": AttitudePD,
-    "rate-oracle": lambda scene, config: Predictive(scene, config, at_this_rate),
-    "clairvoyant": lambda scene, config: Predictive(scene, config, as_it_will_be),
+    "rate-oracle": lambda scene: Predictive(scene, at_this_rate),
+    "clairvoyant": lambda scene: Predictive(scene, as_it_will_be),
 }
 """By the names of `mjx-balance evaluate --controller`."""
 
 
-def make_controller(name: str, scene: Scene, config: Config) -> Controller:
+def make_controller(name: str, scene: Scene) -> Controller:
     """Builds the controller called `name`; raises `ControllerError` with the known names."""
     if name not in CONTROLLERS:
         raise ControllerError(
             f"unknown controller {name!r}; known controllers: {', '.join(CONTROLLERS)}"
         )
-    return CONTROLLERS[name](scene, config)
+    return CONTROLLERS[name](scene)

@@ -46,7 +46,7 @@ class BalanceEnv(Env):
 
     @functools.cached_property
     def _engine(self) -> Engine:
-        return mjx_engine(self.scene, self.config)
+        return mjx_engine(self.scene)
 
     @property
     def observation_size(self) -> int:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 
-from mjx_balance.config import Config, RandomizationConfig, greatest_incline
+from mjx_balance.config import RandomizationConfig, TaskConfig, greatest_incline
 from mjx_balance.controllers import Controller, View
 from mjx_balance.engines.mujoco import Motion, MujocoEngine
 from mjx_balance.policy import Policy, PolicyError
@@ -45,7 +45,7 @@ def observing(policy: Policy) -> Controller:
 class Rollout:
     """What happened, for every scenario and physics step."""
 
-    config: Config
+    task: TaskConfig
     tilt: np.ndarray
     """(scenarios, steps) body tilt, deg; fail_tilt from a fall on."""
     fell_at: np.ndarray
@@ -69,16 +69,15 @@ class _Trials:
     def __init__(
         self,
         scene: Scene,
-        config: Config,
         scenarios: tilt.Scenario,
         conditions: Conditions | None,
         noise_seed: int,
         threads: int | None,
     ):
         count = len(scenarios.phase)
-        self.scene, self.config, self.scenarios = scene, config, scenarios
+        self.scene, self.task, self.scenarios = scene, scene.config.task, scenarios
         self.engine = MujocoEngine(scene, count, conditions, threads)
-        self.table = action_table(config.task)
+        self.table = action_table(self.task)
         # One generator per scenario: its noise is the same whoever runs or falls beside it. The
         # last number tells it from the generator that drew the scenario (suites.py).
         self.rngs = [np.random.default_rng((noise_seed, k, 1)) for k in range(count)]
@@ -89,14 +88,14 @@ class _Trials:
         self.noisy = bool(self.imu_noise.any())
         self.alive = np.arange(count)
         still = np.tile(scene.stance.imu, (count, 1))
-        self.memory = decision.start(config.task, scene.robot, still)
-        self.samples = np.tile(scene.stance.imu, (count, config.task.sim_steps, 1))
+        self.memory = decision.start(self.task, scene.robot, still)
+        self.samples = np.tile(scene.stance.imu, (count, self.task.sim_steps, 1))
         angles = self.engine.state(self.alive)[0][:, scene.leg_qpos]
-        self.obs = decision.observation(config.task, scene.robot, self.memory, angles)
+        self.obs = decision.observation(self.task, scene.robot, self.memory, angles)
 
     def decide(self, controller: Controller, number: int) -> "_Decision":
         """Lets the controller take decision `number` wherever the robot stands."""
-        task, robot, alive = self.config.task, self.scene.robot, self.alive
+        task, robot, alive = self.task, self.scene.robot, self.alive
         some = tilt.Scenario(*(x[alive] for x in self.scenarios))
         late = self.late[alive]
         qpos, qvel = self.engine.state(alive)
@@ -129,8 +128,8 @@ class _Decision(NamedTuple):
 class _Record:
     """What is kept of a rollout; from a fall on, the tilt counts as `fail_tilt`."""
 
-    def __init__(self, scene: Scene, config: Config, count: int, decisions: int, keep_qpos: bool):
-        self.config, self.task = config, config.task
+    def __init__(self, scene: Scene, count: int, decisions: int, keep_qpos: bool):
+        self.task = scene.config.task
         steps = decisions * self.task.sim_steps
         self.tilt = np.full((count, steps), self.task.fail_tilt)
         self.action_mm = np.full((count, decisions), np.nan)
@@ -155,12 +154,11 @@ class _Record:
 
     def rollout(self, seconds: float) -> Rollout:
         """The finished rollout."""
-        return Rollout(self.config, self.tilt, self.fell_at, self.action_mm, self.qpos, seconds)
+        return Rollout(self.task, self.tilt, self.fell_at, self.action_mm, self.qpos, seconds)
 
 
 def roll_out(
     scene: Scene,
-    config: Config,
     controller: Controller,
     scenarios: tilt.Scenario,
     duration: float,
@@ -173,8 +171,7 @@ def roll_out(
     """Runs a controller in plain MuJoCo.
 
     Args:
-      scene: model and stance.
-      config: the task.
+      scene: task, model and stance.
       controller: chooses action indices.
       scenarios: targets (n, k, 2), phase (n,), rate (n,).
       duration: s, rounded up to whole decisions.
@@ -187,9 +184,9 @@ def roll_out(
     Returns:
       The rollout of n scenarios.
     """
-    decisions = int(np.ceil(duration / config.task.ctrl_dt - 1e-9))
-    trials = _Trials(scene, config, scenarios, conditions, noise_seed, threads)
-    kept = _Record(scene, config, len(scenarios.phase), decisions, record)
+    decisions = int(np.ceil(duration / scene.config.task.ctrl_dt - 1e-9))
+    trials = _Trials(scene, scenarios, conditions, noise_seed, threads)
+    kept = _Record(scene, len(scenarios.phase), decisions, record)
     began = time.perf_counter()
     for number in range(decisions):
         kept.add(number, trials.decide(controller, number))
@@ -231,7 +228,7 @@ def settled_action(rollout: Rollout) -> float | None:
     Taken over the last `SETTLED_SECONDS` of every period of a standing robot; none if
     there is no such decision.
     """
-    task = rollout.config.task
+    task = rollout.task
     until = task.target_period - np.arange(rollout.action_mm.shape[1]) * task.ctrl_dt
     until = until % task.target_period
     values = rollout.action_mm[:, (until > 1e-9) & (until <= SETTLED_SECONDS + 1e-9)]
@@ -269,17 +266,15 @@ def evaluate(
       PolicyError: if the policy belongs to another scene.
     """
     scene = policy_scene(policy)
-    rollout = run_suite(
-        scene, policy.config, observing(policy), suite, scenarios, duration, seed, progress
-    )
+    rollout = run_suite(scene, observing(policy), suite, scenarios, duration, seed, progress)
     return summarize(rollout, suite, duration, seed)
 
 
-def check_fits(config: Config, scenarios: int, duration: float, recorded: int = 0) -> None:
+def check_fits(task: TaskConfig, scenarios: int, duration: float, recorded: int = 0) -> None:
     """Refuses an evaluation of nothing, or of more than the memory takes.
 
     Args:
-      config: the task.
+      task: gives the physics step.
       scenarios: how many.
       duration: of each, s.
       recorded: numbers kept of every physics step besides the tilt.
@@ -291,7 +286,7 @@ def check_fits(config: Config, scenarios: int, duration: float, recorded: int = 
         raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
     if not (np.isfinite(duration) and duration > 0):
         raise EvaluationError(f"duration is {duration}; it must be a number of seconds above 0")
-    steps = scenarios * duration / config.task.sim_dt
+    steps = scenarios * duration / task.sim_dt
     needed = 8 * steps * (TILT_COPIES + recorded)
     available = psutil.virtual_memory().available
     if needed > available:
@@ -303,7 +298,6 @@ def check_fits(config: Config, scenarios: int, duration: float, recorded: int = 
 
 def run_suite(
     scene: Scene,
-    config: Config,
     controller: Controller,
     suite: str,
     scenarios: int,
@@ -318,11 +312,10 @@ def run_suite(
       EvaluationError: if there are no scenarios or no time, or too much for the memory.
       SuiteError: as `make_scenarios`.
     """
-    check_fits(config, scenarios, duration, scene.model.nq if record else 0)
-    drawn, conditions = make_scenarios(config, suite, scenarios, duration, seed)
+    check_fits(scene.config.task, scenarios, duration, scene.model.nq if record else 0)
+    drawn, conditions = make_scenarios(scene.config, suite, scenarios, duration, seed)
     return roll_out(
         scene,
-        config,
         controller,
         drawn,
         duration,
@@ -369,7 +362,6 @@ ENVELOPE_RATES = tuple(np.arange(2.5, 6.1, 0.25).tolist())
 
 def envelope(
     scene: Scene,
-    config: Config,
     controller: Controller,
     scenarios: int,
     duration: float,
@@ -386,22 +378,22 @@ def envelope(
     cells = [(i, r) for i in ENVELOPE_INCLINES for r in ENVELOPE_RATES]
     # So that even the slowest board arrives; `corner` alone needs less.
     slowest = 2 * max(ENVELOPE_INCLINES) / min(ENVELOPE_RATES)
-    task = config.task
-    period = max(task.target_period, slowest)
-    config = dataclasses.replace(config, task=dataclasses.replace(task, target_period=period))
-    drawn, _ = make_scenarios(config, "corner", len(cells) * scenarios, duration, seed)
+    task = scene.config.task
+    task = dataclasses.replace(task, target_period=max(task.target_period, slowest))
+    scene = dataclasses.replace(scene, config=dataclasses.replace(scene.config, task=task))
+    drawn, _ = make_scenarios(scene.config, "corner", len(cells) * scenarios, duration, seed)
     incline, rate = np.repeat(np.asarray(cells), scenarios, axis=0).T
     signs = np.sign(drawn.targets)
     drawn = drawn._replace(targets=incline[:, None, None] * signs, rate=rate)
-    rollout = roll_out(scene, config, controller, drawn, duration, progress=progress)
+    rollout = roll_out(scene, controller, drawn, duration, progress=progress)
     shape = (len(ENVELOPE_INCLINES), len(ENVELOPE_RATES), scenarios)
     return Envelope(
         inclines=list(ENVELOPE_INCLINES),
         rates=list(ENVELOPE_RATES),
         fall_rate=rollout.fell.reshape(shape).mean(axis=-1).tolist(),
         mean_tilt=rollout.tilt.mean(axis=-1).reshape(shape).mean(axis=-1).tolist(),
-        authority=authority(config),
-        reach=greatest_incline(config.task, scene.robot),
+        authority=authority(scene.config),
+        reach=greatest_incline(task, scene.robot),
         scenarios=scenarios,
         duration_s=duration,
         seed=seed,

@@ -50,6 +50,8 @@ class Stance:
 class Scene:
     """A compiled model and the addresses everything else needs, looked up once by name."""
 
+    config: Config
+    """What it was built from."""
     robot: Robot
     model: mujoco.MjModel
     leg_qpos: np.ndarray
@@ -164,6 +166,7 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     sensors = [model.sensor(f"{ROBOT}{name}") for name in (robot.gyro, robot.accelerometer)]
     imu = np.concatenate([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in sensors])
     return Scene(
+        config=config,
         robot=robot,
         model=model,
         leg_qpos=leg_qpos,

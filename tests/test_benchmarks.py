@@ -60,11 +60,11 @@ def results(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     spec.loader.exec_module(module)
     module.asked, module.tilt = [], 0.1
 
-    def run_suite(scene, config, controller, suite, scenarios, *more):
+    def run_suite(scene, controller, suite, scenarios, *more):
         module.asked.append(scenarios)
         tilt = np.full((scenarios, 5), module.tilt)
         fell_at, action = np.full(scenarios, 5), np.zeros((scenarios, 1))
-        return Rollout(config, tilt, fell_at, action, None, 1.0)
+        return Rollout(scene.config.task, tilt, fell_at, action, None, 1.0)
 
     monkeypatch.setattr(module, "run_suite", run_suite)
     return module

@@ -234,11 +234,9 @@ def test_evaluate_writes_figures_and_a_video(
     config = preset("default") if who == "controller" else load_policy(SHIPPED).config
     scene = load_scene(config)
     chosen = (
-        make_controller("pd-imu", scene, config)
-        if who == "controller"
-        else observing(load_policy(SHIPPED))
+        make_controller("pd-imu", scene) if who == "controller" else observing(load_policy(SHIPPED))
     )
-    rollout = run_suite(scene, config, chosen, "corner", 2, 0.4, 5)
+    rollout = run_suite(scene, chosen, "corner", 2, 0.4, 5)
     expected = summarize(rollout, "corner", 0.4, 5)
     speeds = [found.pop("physics_steps_per_second") for found in (result, expected)]
     assert result == expected

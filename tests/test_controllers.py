@@ -61,17 +61,17 @@ def make_view(
     )
 
 
-def test_standing_still_is_the_action_that_changes_nothing(config: Config, scene: Scene) -> None:
+def test_standing_still_is_the_action_that_changes_nothing(scene: Scene) -> None:
     view = make_view(scene, np.full((3, 3), 5.0))
-    assert Stand(scene, config)(view).tolist() == [220, 220, 220]
+    assert Stand(scene)(view).tolist() == [220, 220, 220]
 
 
-def test_proportional_and_derivative_by_hand(config: Config, scene: Scene) -> None:
+def test_proportional_and_derivative_by_hand(scene: Scene) -> None:
     """Roll 0.4 deg at 1 deg/s: -(1.3 * 0.4 + 0.12) / 400 = -1.6 mm, that is -1.5, level 5.
 
     Pitch -0.2 deg at 0.5 deg/s: -(1.3 * -0.2 + 0.12 * 0.5) / -300 = -0.667 mm, -0.6, level 8.
     """
-    controller = AttitudePD(scene, config)
+    controller = AttitudePD(scene)
     controller.gain = np.asarray((400.0, -300.0))
     view = make_view(
         scene,
@@ -84,24 +84,24 @@ def test_proportional_and_derivative_by_hand(config: Config, scene: Scene) -> No
     np.testing.assert_allclose(rate[1], (1.0, 0.5), atol=1e-9)
 
 
-def test_gains_are_arguments(config: Config, scene: Scene) -> None:
+def test_gains_are_arguments(scene: Scene) -> None:
     """-(0.5 * 0.4 + 0.2 * 1) / 400 = -1 mm: -0.9, level 7."""
-    controller = AttitudePD(scene, config, proportional=0.5, rate=0.2)
+    controller = AttitudePD(scene, proportional=0.5, rate=0.2)
     controller.gain = np.asarray((400.0, -300.0))
     view = make_view(scene, np.asarray([(0.4, 0.0, 0.0)]), np.asarray([(1.0, 0.0, 0.0)]))
     assert controller(view).tolist() == [21 * 7 + 10]
 
 
-def test_gains_are_those_that_the_benchmark_found_best(config: Config, scene: Scene) -> None:
-    imu, true = ImuPD(scene, config), AttitudePD(scene, config)
+def test_gains_are_those_that_the_benchmark_found_best(scene: Scene) -> None:
+    imu, true = ImuPD(scene), AttitudePD(scene)
     assert (imu.proportional, imu.rate, imu.tau, imu.samples) == (1.2, 0.14, 4.0, 1)
     assert (true.proportional, true.rate) == (1.3, 0.12)
 
 
-def test_complementary_filter_sample_by_sample(config: Config, scene: Scene) -> None:
+def test_complementary_filter_sample_by_sample(scene: Scene) -> None:
     """Predict by the gyro, lean toward gravity's direction; worlds keep their own angle."""
     rng = np.random.default_rng(0)
-    controller = ImuPD(scene, config, tau=0.5, samples=3)
+    controller = ImuPD(scene, tau=0.5, samples=3)
     angle, leak = np.zeros((3, 2)), 0.004 / 0.504
     for decision, ids in enumerate(([0, 1, 2], [2, 0])):
         lean = rng.uniform(-20, 20, (len(ids), 50, 2))
@@ -124,8 +124,8 @@ def test_complementary_filter_sample_by_sample(config: Config, scene: Scene) -> 
         np.testing.assert_allclose(rate, np.degrees(gyro[:, -3:, :2].mean(axis=1)), atol=1e-9)
 
 
-def test_filter_starts_anew_with_every_evaluation(config: Config, scene: Scene) -> None:
-    controller = ImuPD(scene, config)
+def test_filter_starts_anew_with_every_evaluation(scene: Scene) -> None:
+    controller = ImuPD(scene)
     tilted = np.tile((0.5, 0.5, 0.0, 1.0, 1.0, 9.7), (2, 50, 1))
     first = controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted))[0]
     controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted, decision=1))
@@ -134,9 +134,9 @@ def test_filter_starts_anew_with_every_evaluation(config: Config, scene: Scene) 
 
 
 @pytest.fixture(scope="module")
-def courses(config: Config, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def courses(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Gain (2,) in deg/m and course (2, 400) of one action."""
-    response = measure_response(scene, config)
+    response = measure_response(scene)
     return response.gain, response.course
 
 
@@ -169,7 +169,7 @@ def test_plans_are_the_least_squares_optimum(
     """
     monkeypatch.setattr(sys.modules[Predictive.__module__], "SWEEPS", 400)
     gain, course = courses
-    controller = Predictive(scene, config, as_it_will_be)
+    controller = Predictive(scene, as_it_will_be)
     limits = np.abs(gain) * 0.003
     targets = np.asarray([[(5.0, -3.0), (5.0, -3.0)]])
     taken = [np.zeros(2)]  # in the order in which they act
@@ -211,7 +211,7 @@ def test_a_tilt_within_one_action_is_taken_back_at_once(
 ) -> None:
     """On a board at rest: the height change that undoes 0.5 deg of roll and 0.3 of pitch."""
     gain, _ = courses
-    controller = Predictive(scene, config, at_this_rate)
+    controller = Predictive(scene, at_this_rate)
     tilted = np.asarray([(0.5, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 45.0)])
     got = action_table(config.task)[controller(make_view(scene, tilted))]
     expected = [(-0.5 / gain[0], 0.0), (0.0, -0.3 / gain[1]), (0.0, 0.0)]
@@ -247,22 +247,20 @@ def test_forecasts_of_a_ramp() -> None:
         assert not forecast(task, scenario, resting, ahead).any()
 
 
-def test_controllers_by_name(config: Config, scene: Scene) -> None:
+def test_controllers_by_name(scene: Scene) -> None:
     names = "none pd-imu pd-attitude rate-oracle clairvoyant".split()
-    kinds = [type(make_controller(name, scene, config)) for name in names]
+    kinds = [type(make_controller(name, scene)) for name in names]
     assert kinds == [Stand, ImuPD, AttitudePD, Predictive, Predictive]
-    oracles = [make_controller(name, scene, config) for name in names[3:]]
+    oracles = [make_controller(name, scene) for name in names[3:]]
     forecasts = [c.forecast for c in oracles if isinstance(c, Predictive)]
     assert forecasts == [at_this_rate, as_it_will_be]
 
 
-def test_knowing_more_means_tilting_less(config: Config, scene: Scene) -> None:
+def test_knowing_more_means_tilting_less(scene: Scene) -> None:
     mean, falls = {}, {}
     for name in CONTROLLERS:
-        controller = make_controller(name, scene, config)
-        result = summarize(
-            run_suite(scene, config, controller, "paper", 8, 25.0, 5), "paper", 25.0, 5
-        )
+        controller = make_controller(name, scene)
+        result = summarize(run_suite(scene, controller, "paper", 8, 25.0, 5), "paper", 25.0, 5)
         mean[name], falls[name] = result["tilt_deg"]["mean"], result["falls"]
     assert falls["none"] > 0
     assert not any(n for name, n in falls.items() if name != "none")
@@ -271,25 +269,25 @@ def test_knowing_more_means_tilting_less(config: Config, scene: Scene) -> None:
     assert mean["rate-oracle"] < 0.1
 
 
-def test_the_oracles_know_of_latency(config: Config, scene: Scene) -> None:
+def test_the_oracles_know_of_latency(scene: Scene) -> None:
     """A controller that does not takes back the same tilt twice."""
 
     def mean(name: str) -> float:
-        controller = make_controller(name, scene, config)
-        return float(run_suite(scene, config, controller, "latency", 4, 20.0, 5).tilt.mean())
+        controller = make_controller(name, scene)
+        return float(run_suite(scene, controller, "latency", 4, 20.0, 5).tilt.mean())
 
     means = {name: mean(name) for name in ("pd-attitude", "rate-oracle", "clairvoyant")}
     assert means["clairvoyant"] < means["rate-oracle"] < 0.3 < 0.6 < means["pd-attitude"]
 
 
-def test_filters_keep_every_worlds_own_memory(config: Config, scene: Scene) -> None:
+def test_filters_keep_every_worlds_own_memory(scene: Scene) -> None:
     """A world's tilt does not depend on which others run, or fall, beside it."""
-    controller = make_controller("pd-imu", scene, config)
-    many = run_suite(scene, config, controller, "corner", 3, 4.0, 0).tilt
-    alone = run_suite(scene, config, controller, "corner", 1, 4.0, 0).tilt
+    controller = make_controller("pd-imu", scene)
+    many = run_suite(scene, controller, "corner", 3, 4.0, 0).tilt
+    alone = run_suite(scene, controller, "corner", 1, 4.0, 0).tilt
     np.testing.assert_allclose(many[0], alone[0], atol=1e-9)
 
 
-def test_unknown_controller_is_refused(config: Config, scene: Scene) -> None:
+def test_unknown_controller_is_refused(scene: Scene) -> None:
     with pytest.raises(ControllerError, match="unknown controller 'lqr'; known controllers: none"):
-        make_controller("lqr", scene, config)
+        make_controller("lqr", scene)

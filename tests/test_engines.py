@@ -52,7 +52,6 @@ def courses(fleet: Fleet, closed_loop: list[Any]) -> tuple[Course, Course]:
     double = {k: np.asarray(v, float) for k, v in start["conditions"]._asdict().items()}
     rollout = roll_out(
         env.scene,
-        env.config,
         watched,
         Scenario(*(np.asarray(x, float) for x in start["scenario"])),
         10.0,
@@ -164,7 +163,7 @@ def test_mjx_solves_as_the_config_says_and_leaves_the_scene_alone(
     original = mjx.put_model
     monkeypatch.setattr(mjx, "put_model", put_model)
     config = dataclasses.replace(config, solver_iterations=7, line_search_iterations=9)
-    engine = mjx_engine(scene, config)
+    engine = mjx_engine(dataclasses.replace(scene, config=config))
     assert seen == [(7, 9, 0.004)]
     assert scene.model.opt.iterations == 100
     assert scene.model.opt.ls_iterations == 50
@@ -199,7 +198,7 @@ def test_every_servo_gets_its_own_target(scene: Scene, xp: types.ModuleType) -> 
             assert ctrl[0, step, order[2 + 3 * leg + joint]] == pytest.approx(told, rel=1e-6)
 
 
-def test_c_engine_is_mj_step(config: Config, scene: Scene) -> None:
+def test_c_engine_is_mj_step(scene: Scene) -> None:
     """Robots 1 and 3 of four, 50 steps of servo targets each; the others stay where they are."""
     engine = MujocoEngine(scene, 4, threads=1)
     rng, ids = np.random.default_rng(0), np.asarray((1, 3))
@@ -238,7 +237,7 @@ def test_c_engine_warns_of_the_robot_that_diverges_alone(scene: Scene) -> None:
     np.testing.assert_array_equal(engine.advance(ids, 0 * ctrl[:, :1]).warned, (False, True))
 
 
-def test_circumstances_are_those_of_models_made_so(config: Config, scene: Scene) -> None:
+def test_circumstances_are_those_of_models_made_so(scene: Scene) -> None:
     """Payload as a body of its own, other servos and soles: compiled by MuJoCo, stepped by it.
 
     The first load sits on the trunk's axis. The second does not, and the products of inertia
@@ -261,7 +260,6 @@ def test_circumstances_are_those_of_models_made_so(config: Config, scene: Scene)
     motion = engine.advance(np.arange(2), ctrl)
     for k, most in ((0, 1e-7), (1, 2e-4)):
         model = loaded_model(
-            config,
             scene,
             *(np.asarray(x)[k] for x in conditions[1:5]),  # load, at, friction, gain
         )
@@ -278,7 +276,7 @@ def test_circumstances_are_those_of_models_made_so(config: Config, scene: Scene)
 
 
 def loaded_model(
-    config: Config, scene: Scene, load: float, at: np.ndarray, friction: float, gain: float
+    scene: Scene, load: float, at: np.ndarray, friction: float, gain: float
 ) -> mujoco.MjModel:
     """A robot that carries a small heavy body, from the scene's files."""
     stage, board, body = (

@@ -164,7 +164,7 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
     """
     lags = {"command_lags": (0, 2), "imu_mean": 4, "gyro_lags": (0, 20), "accel_lags": (3, 60)}
     task = dataclasses.replace(config.task, **(lags if rich else {}))  # pyright: ignore[reportArgumentType]
-    config = dataclasses.replace(config, task=task)
+    scene = dataclasses.replace(scene, config=dataclasses.replace(config, task=task))
     targets = np.asarray([[(4.0, -2.0)], [(-3.0, 1.0)]])
     scenarios = Scenario(targets, np.zeros(2), np.asarray((3.5, 2.0)))
     conditions = nominal(2)._replace(
@@ -179,14 +179,14 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
     def act(view: View) -> np.ndarray:
         assert view.late.tolist() == [False, True]
         for k, world in enumerate(worlds):
-            np.testing.assert_allclose(view.obs[k], world.observation(config), atol=1e-6)
+            np.testing.assert_allclose(view.obs[k], world.observation(scene.config), atol=1e-6)
             np.testing.assert_allclose(view.imu[k], world.imu[-50:], atol=1e-7)
             np.testing.assert_allclose(view.qpos[k], world.data.qpos, atol=1e-9)
             np.testing.assert_allclose(view.qvel[k], world.data.qvel, atol=1e-8)
             world.decide(actions[view.decision, k], targets[k, 0], (3.5, 2.0)[k])
         return actions[view.decision]
 
-    rollout = roll_out(scene, config, act, scenarios, 1.2, record=True, conditions=conditions)
+    rollout = roll_out(scene, act, scenarios, 1.2, record=True, conditions=conditions)
     assert rollout.qpos is not None
     expected = np.asarray([world.qpos for world in worlds])
     np.testing.assert_allclose(rollout.qpos, expected, atol=1e-9)
@@ -202,7 +202,7 @@ def test_tilt_counts_six_from_the_very_step_of_the_fall(config: Config, scene: S
     """Against the recorded attitudes: the first step beyond 6 deg, of one world of three."""
     scenarios = level_boards(config, 3, 3.0)
     actions = np.asarray((STAND, LEFT_UP, STAND))
-    rollout = roll_out(scene, config, lambda view: actions[view.ids], scenarios, 3.0, record=True)
+    rollout = roll_out(scene, lambda view: actions[view.ids], scenarios, 3.0, record=True)
     assert rollout.qpos is not None
     quat = rollout.qpos[1][:, scene.trunk_quat]
     up = Rotation.from_quat(quat, scalar_first=True).apply((0, 0, 1))[:, 2]
@@ -225,7 +225,7 @@ def test_tilt_counts_six_from_the_very_step_of_the_fall(config: Config, scene: S
 def test_who_fell_is_out_even_if_it_rights_itself(config: Config, scene: Scene) -> None:
     """One step overshoots by a little: a limit between its peak and its end ends the scenario."""
     scenarios = level_boards(config, 1, 1.0)
-    course = roll_out(scene, config, always(LEFT_UP), scenarios, 0.2).tilt[0]
+    course = roll_out(scene, always(LEFT_UP), scenarios, 0.2).tilt[0]
     limit = float(course.max() + course[-1]) / 2
     assert course[-1] < limit < course.max()
     strict = dataclasses.replace(config, task=dataclasses.replace(config.task, fail_tilt=limit))
@@ -235,7 +235,7 @@ def test_who_fell_is_out_even_if_it_rights_itself(config: Config, scene: Scene) 
         calls.append(view.decision)
         return np.full(1, LEFT_UP if view.decision == 0 else STAND)
 
-    rollout = roll_out(scene, strict, once, scenarios, 1.0)
+    rollout = roll_out(dataclasses.replace(scene, config=strict), once, scenarios, 1.0)
     assert calls == [0]
     assert rollout.fell_at[0] == np.flatnonzero(course > limit)[0]
     assert (rollout.tilt[0, rollout.fell_at[0] :] == limit).all()
@@ -266,7 +266,6 @@ def test_the_standing_are_shown_their_own_world_when_others_have_fallen(
 
         return roll_out(
             scene,
-            config,
             act,
             Scenario(*(x[first:] for x in drawn)),
             4.0,
@@ -285,7 +284,7 @@ def made_up(config: Config, **values: Any) -> Rollout:
     """A rollout of two scenarios of 100 steps with tilts 0.00, 0.01, ..., 1.99, shuffled."""
     tilt = np.random.default_rng(0).permutation(200).reshape(2, 100) / 100
     rollout = Rollout(
-        config=config,
+        task=config.task,
         tilt=tilt,
         fell_at=np.asarray((100, 30)),
         action_mm=np.asarray([(0.3, 0.9), (0.6, np.nan)]),
@@ -390,17 +389,17 @@ def test_cells_of_the_envelope_are_inclines_by_speeds(
     """A made-up world where a board falls beyond 8 deg or 5 deg/s, tilted by both."""
     asked = []
 
-    def roll(scene: Scene, config: Config, controller: Any, drawn: Scenario, *_: Any, **__: Any):
-        asked.append((config, drawn))
+    def roll(scene: Scene, controller: Any, drawn: Scenario, *_: Any, **__: Any):
+        asked.append((scene.config, drawn))
         incline, rate = np.abs(drawn.targets[:, 0, 0]), drawn.rate
         fell = (incline > 8) | (rate > 5)
         # One of the two scenarios of a cell in the corner stands.
         fell[np.flatnonzero((incline == 12) & (rate == 6))[1]] = False
         tilt = np.tile((incline + rate / 100)[:, None], (1, 4))
-        return Rollout(config, tilt, np.where(fell, 1, 4), np.zeros((len(fell), 1)), None, 1.0)
+        return Rollout(config.task, tilt, np.where(fell, 1, 4), np.zeros((len(fell), 1)), None, 1.0)
 
     monkeypatch.setattr(evaluation, "roll_out", roll)
-    found = envelope(scene, config, always(STAND), 2, 12.0, 3)
+    found = envelope(scene, always(STAND), 2, 12.0, 3)
     assert found.inclines == list(range(2, 13))
     assert found.rates == [2.5 + 0.25 * k for k in range(15)]
     falls, tilt = np.asarray(found.fall_rate), np.asarray(found.mean_tilt)
@@ -417,10 +416,10 @@ def test_cells_of_the_envelope_are_inclines_by_speeds(
     assert (np.abs(drawn.targets) == np.abs(drawn.targets[:, :1, :1])).all(), "both axes at once"
     assert len(np.unique(np.sign(drawn.targets).reshape(-1, 2), axis=0)) == 4
     hasty = dataclasses.replace(config, task=dataclasses.replace(config.task, target_period=5.0))
-    envelope(scene, hasty, always(STAND), 2, 12.0, 3)
+    envelope(dataclasses.replace(scene, config=hasty), always(STAND), 2, 12.0, 3)
     assert asked[1][0].task.target_period == pytest.approx(9.6)
     with pytest.raises(EvaluationError, match="scenarios is 0"):
-        envelope(scene, config, always(STAND), 0, 12.0, 3)
+        envelope(scene, always(STAND), 0, 12.0, 3)
 
 
 @pytest.mark.parametrize(("duration", "decisions"), [(0.6, 3), (3 * 0.2, 3), (0.5, 3), (0.01, 1)])
@@ -429,7 +428,7 @@ def test_duration_is_rounded_up_to_whole_decisions(
 ) -> None:
     done = []
     rollout = roll_out(
-        scene, config, always(STAND), level_boards(config, 1, 2.0), duration, progress=done.append
+        scene, always(STAND), level_boards(config, 1, 2.0), duration, progress=done.append
     )
     assert rollout.tilt.shape == (1, 50 * decisions)
     assert rollout.action_mm.shape == (1, decisions)
@@ -439,7 +438,7 @@ def test_duration_is_rounded_up_to_whole_decisions(
 
 
 def test_what_does_not_fit_into_memory_is_refused_before_it_begins(
-    config: Config, scene: Scene, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """2 scenarios of 1 s are 500 steps: 12 kB of tilts, 96 kB with every position."""
 
@@ -448,23 +447,21 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_begins(
         monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
 
     free(20_000)
-    run_suite(scene, config, always(STAND), "paper", 2, 1.0, 0)
+    run_suite(scene, always(STAND), "paper", 2, 1.0, 0)
     with pytest.raises(EvaluationError, match=r"scenarios is 2 and duration 1 s: .* lower one"):
-        run_suite(scene, config, always(STAND), "paper", 2, 1.0, 0, record=True)
+        run_suite(scene, always(STAND), "paper", 2, 1.0, 0, record=True)
     free(10_000)
     with pytest.raises(EvaluationError, match="scenarios is 2 and duration 1 s"):
-        run_suite(scene, config, always(STAND), "paper", 2, 1.0, 0)
+        run_suite(scene, always(STAND), "paper", 2, 1.0, 0)
 
 
 @pytest.mark.parametrize("duration", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_duration_that_is_no_time_is_refused(
-    config: Config, scene: Scene, duration: float
-) -> None:
+def test_a_duration_that_is_no_time_is_refused(scene: Scene, duration: float) -> None:
     with pytest.raises(EvaluationError, match="duration is"):
-        run_suite(scene, config, always(STAND), "paper", 1, duration, 0)
+        run_suite(scene, always(STAND), "paper", 1, duration, 0)
 
 
-def watch_imu(scene: Scene, config: Config, suite: str, count: int, seed: int) -> np.ndarray:
+def watch_imu(scene: Scene, suite: str, count: int, seed: int) -> np.ndarray:
     """(decisions, 50, 6) samples of world 0, whose last neighbour falls at once if there is one."""
     seen = []
 
@@ -472,20 +469,18 @@ def watch_imu(scene: Scene, config: Config, suite: str, count: int, seed: int) -
         seen.append(view.imu[0])
         return np.where(view.ids == 2, LEFT_UP, STAND)
 
-    run_suite(scene, config, act, suite, count, 2.0, seed)
+    run_suite(scene, act, suite, count, 2.0, seed)
     return np.asarray(seen)
 
 
-def test_suites_bring_their_circumstances(config: Config, scene: Scene) -> None:
+def test_suites_bring_their_circumstances(scene: Scene) -> None:
     """Noise differs from seed to seed, and the first decision sees none yet."""
-    quiet, noisy, again = (
-        watch_imu(scene, config, name, 1, 0) for name in ("paper", "noise", "noise")
-    )
+    quiet, noisy, again = (watch_imu(scene, name, 1, 0) for name in ("paper", "noise", "noise"))
     np.testing.assert_array_equal(quiet[0], noisy[0])
     np.testing.assert_array_equal(noisy, again)
     jitter = (noisy - quiet)[1:]
     np.testing.assert_allclose(jitter.std(axis=(0, 1)), [0.002] * 3 + [0.023] * 3, rtol=0.2)
-    still, shaken = (watch_imu(scene, config, name, 1, 1)[1:4] for name in ("paper", "noise"))
+    still, shaken = (watch_imu(scene, name, 1, 1)[1:4] for name in ("paper", "noise"))
     assert abs(np.corrcoef((shaken - still).ravel(), jitter[:3].ravel())[0, 1]) < 0.2
     for suite, late in (("latency", True), ("paper", False), ("payload", False)):
         told = []
@@ -494,19 +489,17 @@ def test_suites_bring_their_circumstances(config: Config, scene: Scene) -> None:
             told += view.late.tolist()
             return np.full(len(view.ids), STAND)
 
-        run_suite(scene, config, act, suite, 3, 0.2, 0)
+        run_suite(scene, act, suite, 3, 0.2, 0)
         assert told == [late] * 3
 
 
-def test_noise_of_a_world_does_not_depend_on_its_neighbours(config: Config, scene: Scene) -> None:
+def test_noise_of_a_world_does_not_depend_on_its_neighbours(scene: Scene) -> None:
     """Scenario k is the same however many there are and whoever falls: its noise too."""
-    alone = watch_imu(scene, config, "noise", 1, 0)
-    np.testing.assert_allclose(watch_imu(scene, config, "noise", 3, 0), alone, atol=1e-9)
+    alone = watch_imu(scene, "noise", 1, 0)
+    np.testing.assert_allclose(watch_imu(scene, "noise", 3, 0), alone, atol=1e-9)
 
 
-def test_noise_of_a_world_does_not_depend_on_who_fell_before_it(
-    config: Config, scene: Scene
-) -> None:
+def test_noise_of_a_world_does_not_depend_on_who_fell_before_it(scene: Scene) -> None:
     """World 0 falls within 1.2 s or stands; world 1 sees the same samples for 2 s."""
     seen: dict[int, list[np.ndarray]] = {LEFT_UP: [], STAND: []}
     for action, samples in seen.items():
@@ -515,7 +508,7 @@ def test_noise_of_a_world_does_not_depend_on_who_fell_before_it(
             samples.append(view.imu[view.ids == 1][0])
             return np.where(view.ids == 0, action, STAND)
 
-        fell = run_suite(scene, config, act, "noise", 2, 2.0, 0).fell
+        fell = run_suite(scene, act, "noise", 2, 2.0, 0).fell
         np.testing.assert_array_equal(fell, (action == LEFT_UP, False))
     np.testing.assert_array_equal(seen[LEFT_UP], seen[STAND])
 
@@ -523,7 +516,7 @@ def test_noise_of_a_world_does_not_depend_on_who_fell_before_it(
 def test_standing_still_on_a_level_board_stays_level(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "paper", 2, 4.0, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)
-    rollout = roll_out(scene, config, always(STAND), level, 4.0)
+    rollout = roll_out(scene, always(STAND), level, 4.0)
     assert not rollout.fell.any()
     assert rollout.tilt.max() < 0.05
     assert np.all(rollout.action_mm == 0)
@@ -532,7 +525,7 @@ def test_standing_still_on_a_level_board_stays_level(config: Config, scene: Scen
 def test_without_control_the_body_follows_the_board(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "paper", 1, 4.0, 0)
     held = scenarios._replace(targets=np.tile((3.0, 4.0), (1, scenarios.targets.shape[1], 1)))
-    rollout = roll_out(scene, config, always(STAND), held, 4.0)
+    rollout = roll_out(scene, always(STAND), held, 4.0)
     assert not rollout.fell.any()
     assert rollout.tilt[0, -1] == pytest.approx(5.0, abs=0.3)
 
@@ -542,7 +535,7 @@ def test_raising_the_left_side_tilts_the_body_and_a_fall_counts_to_the_end(
 ) -> None:
     scenarios = draw(config, "paper", 3, 8.0, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)
-    rollout = roll_out(scene, config, always(LEFT_UP), level, 8.0)
+    rollout = roll_out(scene, always(LEFT_UP), level, 8.0)
     assert rollout.fell.all()
     # 3 mm over a half-track of 142 mm is 1.2 deg a decision: 6 deg take 5 or 6 decisions.
     assert np.all((rollout.fell_at > 4 * 50) & (rollout.fell_at < 7 * 50))
@@ -560,14 +553,14 @@ def test_a_simulation_that_is_no_number_counts_as_a_fall(config: Config, scene: 
     scenarios = draw(config, "paper", 3, 1.0, 0)
     targets = 0 * scenarios.targets
     targets[1] = np.nan
-    rollout = roll_out(scene, config, always(STAND), scenarios._replace(targets=targets), 1.0)
+    rollout = roll_out(scene, always(STAND), scenarios._replace(targets=targets), 1.0)
     np.testing.assert_array_equal(rollout.fell, (False, True, False))
     assert np.isfinite(rollout.tilt).all()
 
 
 def test_one_thread_gives_what_many_give(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "corner", 5, 2.0, 0)
-    one, two = (roll_out(scene, config, always(STAND), scenarios, 2.0, n).tilt for n in (1, 2))
+    one, two = (roll_out(scene, always(STAND), scenarios, 2.0, n).tilt for n in (1, 2))
     np.testing.assert_array_equal(one, two)
 
 
@@ -575,7 +568,7 @@ def test_one_thread_gives_what_many_give(config: Config, scene: Scene) -> None:
     ("scenarios", "duration", "named"), [(0, 1.0, "scenarios is 0"), (1, 0.0, "duration is 0")]
 )
 def test_no_scenarios_and_no_time_are_refused(
-    config: Config, scene: Scene, scenarios: int, duration: float, named: str, policy_file: Path
+    scene: Scene, scenarios: int, duration: float, named: str, policy_file: Path
 ) -> None:
     from mjx_balance import load_policy
 
@@ -620,8 +613,8 @@ def test_the_command_writes_the_contract_and_imports_no_jax(
 
 def test_nominal_conditions_change_nothing(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "corner", 3, 2.0, 0)
-    plain = roll_out(scene, config, always(LEFT_UP), scenarios, 2.0)
-    same = roll_out(scene, config, always(LEFT_UP), scenarios, 2.0, conditions=nominal(3))
+    plain = roll_out(scene, always(LEFT_UP), scenarios, 2.0)
+    same = roll_out(scene, always(LEFT_UP), scenarios, 2.0, conditions=nominal(3))
     np.testing.assert_allclose(plain.tilt, same.tilt, atol=1e-6)
 
 
@@ -631,7 +624,7 @@ def test_a_payload_off_the_centre_bends_the_legs_under_it(config: Config, scene:
     loaded = nominal(2)._replace(
         payload=np.asarray((0.0, 5.0)), payload_at=np.asarray(((0.0, 0, 0), (0.1, 0, 0.1)))
     )
-    rollout = roll_out(scene, config, always(STAND), level, 2.0, conditions=loaded, record=True)
+    rollout = roll_out(scene, always(STAND), level, 2.0, conditions=loaded, record=True)
     assert rollout.qpos is not None
     height = rollout.qpos[:, -1, scene.trunk_quat[0] - 1]
     assert rollout.tilt[0, -1] < 0.05 < rollout.tilt[1, -1]
@@ -642,7 +635,7 @@ def test_weak_servos_sag(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "paper", 2, 2.0, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)
     weak = nominal(2)._replace(gain=np.asarray((1.0, 0.8)))
-    rollout = roll_out(scene, config, always(STAND), level, 2.0, conditions=weak, record=True)
+    rollout = roll_out(scene, always(STAND), level, 2.0, conditions=weak, record=True)
     assert rollout.qpos is not None
     height = rollout.qpos[:, -1, scene.trunk_quat[0] - 1]
     assert height[1] < height[0] - 5e-4
@@ -653,7 +646,7 @@ def test_feet_slide_where_friction_is_low(config: Config, scene: Scene) -> None:
     held = draw(config, "paper", 2, 4.0, 0)
     held = held._replace(targets=np.tile((0.0, 4.5), (2, held.targets.shape[1], 1)))
     icy = nominal(2)._replace(friction=np.asarray((0.4, 0.05)))
-    rollout = roll_out(scene, config, always(STAND), held, 4.0, conditions=icy, record=True)
+    rollout = roll_out(scene, always(STAND), held, 4.0, conditions=icy, record=True)
     assert rollout.qpos is not None
     x = np.abs(rollout.qpos[:, -1, scene.trunk_quat[0] - 3])
     assert x[0] < 0.05 < x[1]
@@ -663,7 +656,7 @@ def test_late_actions_arrive_one_decision_late(config: Config, scene: Scene) -> 
     scenarios = draw(config, "paper", 2, 0.6, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)
     late = nominal(2)._replace(latency=np.asarray((0.0, 1.0)))
-    rollout = roll_out(scene, config, always(LEFT_UP), level, 0.6, conditions=late)
+    rollout = roll_out(scene, always(LEFT_UP), level, 0.6, conditions=late)
     prompt, delayed = rollout.tilt
     assert prompt[45] > 1.0 > 0.05 > delayed[45]
     np.testing.assert_allclose(delayed[50:], prompt[:100], atol=0.03)
@@ -681,7 +674,7 @@ def test_imu_noise_has_the_size_asked_for_and_is_seen_by_the_controller(
         seen.append(view)
         return np.full(len(view.ids), STAND)
 
-    roll_out(scene, config, watch, level, 1.0, conditions=noisy)
+    roll_out(scene, watch, level, 1.0, conditions=noisy)
     imu = seen[-1].imu
     assert imu.shape == (40, 50, 6)
     np.testing.assert_allclose(imu[..., :3].std(), 0.002, rtol=0.05)
@@ -690,9 +683,9 @@ def test_imu_noise_has_the_size_asked_for_and_is_seen_by_the_controller(
     np.testing.assert_allclose(seen[-1].obs[:, 16], newest, rtol=1e-6)
 
 
-def test_envelope_of_standing_still(config: Config, scene: Scene) -> None:
+def test_envelope_of_standing_still(scene: Scene) -> None:
     """Who never moves falls where 6 deg are passed: from 4.25 deg on both axes at once."""
-    found = envelope(scene, config, always(STAND), 1, 12.0, 0)
+    found = envelope(scene, always(STAND), 1, 12.0, 0)
     falls = np.asarray(found.fall_rate)
     assert falls.shape == (len(found.inclines), len(found.rates))
     assert not falls[np.asarray(found.inclines) < 4.1].any()
@@ -704,11 +697,11 @@ def test_envelope_of_standing_still(config: Config, scene: Scene) -> None:
     assert found.fall_free_share == pytest.approx(share)
 
 
-def test_a_policy_is_a_controller(config: Config, scene: Scene, policy_file: Path) -> None:
+def test_a_policy_is_a_controller(scene: Scene, policy_file: Path) -> None:
     from mjx_balance import load_policy
 
     policy = load_policy(policy_file)
-    rollout = run_suite(scene, config, observing(policy), "paper", 2, 1.0, 3)
+    rollout = run_suite(scene, observing(policy), "paper", 2, 1.0, 3)
     result = evaluate(policy, "paper", 2, 1.0, 3)
     assert result["tilt_deg"]["mean"] == rollout.tilt.mean()
 

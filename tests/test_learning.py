@@ -129,7 +129,7 @@ def test_actions_are_random_first_and_the_policys_later(run: Run) -> None:
     assert 0.5 < away[:, (away <= 3).all(axis=0)].mean() < 1.7, "a fidget of -2 to 2 levels"
 
 
-def still_engine(scene: Scene, config: Config) -> Engine:
+def still_engine(scene: Scene) -> Engine:
     """Physics in which nothing moves: what tracing needs of an engine."""
     with jax.ensure_compile_time_eval():
         stance = scene.stance

@@ -50,4 +50,4 @@ def test_scenarios_of_the_check_do_tilt(config: Config, scene: Scene) -> None:
     from mjx_balance.evaluation import roll_out
 
     drawn, _ = make_scenarios(config, "corner", 8, 20.0, 11)
-    assert roll_out(scene, config, make_controller("none", scene, config), drawn, 20.0).fell.all()
+    assert roll_out(scene, make_controller("none", scene), drawn, 20.0).fell.all()

@@ -7,7 +7,7 @@ import pytest
 
 from mjx_balance.config import Config, greatest_incline
 from mjx_balance.robots import Robot
-from mjx_balance.suites import SUITES, SuiteError, authority, find_suite, make_scenarios
+from mjx_balance.suites import SEEDS, SUITES, SuiteError, authority, find_suite, make_scenarios
 from mjx_balance.task.randomization import DRAWS
 
 
@@ -108,6 +108,12 @@ def test_suites_are_known_by_these_names() -> None:
     names = "paper corner noise payload friction gains latency fast steep".split()
     assert set(names) <= set(SUITES)
     assert all(SUITES[name].summary for name in SUITES)
+
+
+def test_no_seed_serves_two_purposes() -> None:
+    """What a policy is chosen or tuned by must not be what it is judged by."""
+    seeds = dataclasses.astuple(SEEDS)
+    assert len(set(seeds)) == len(seeds) == 6
 
 
 def test_paper_fills_the_disc_and_corner_its_corners(config: Config) -> None:

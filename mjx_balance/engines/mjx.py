@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mjx_balance.config import Config
 from mjx_balance.scene import Scene
 from mjx_balance.task.attitude import body_tilt
 
@@ -51,11 +50,11 @@ class Engine(NamedTuple):
     """By one decision."""
 
 
-def mjx_engine(scene: Scene, config: Config) -> Engine:
-    """Puts the scene's model on the device, with the solver settings of the config."""
+def mjx_engine(scene: Scene) -> Engine:
+    """Puts the scene's model on the device, with the solver settings of its config."""
     training_model = copy.copy(scene.model)
-    training_model.opt.iterations = config.solver_iterations
-    training_model.opt.ls_iterations = config.line_search_iterations
+    training_model.opt.iterations = scene.config.solver_iterations
+    training_model.opt.ls_iterations = scene.config.line_search_iterations
     with jax.ensure_compile_time_eval():  # constants, even where this runs inside a trace
         model = mjx.put_model(training_model)
         blank = mjx.make_data(training_model)

@@ -199,7 +199,7 @@ def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
 def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
     """Board X, board Y, body roll and body pitch on four axes."""
     assert rollout.qpos is not None, "the rollout is not recorded"
-    task, qpos = rollout.config.task, rollout.qpos[0]
+    task, qpos = rollout.task, rollout.qpos[0]
     time = np.arange(1, len(qpos) + 1) * task.sim_dt
     board = np.degrees(qpos[:, scene.board_qpos])
     roll, pitch = roll_pitch(qpos[:, scene.trunk_quat])

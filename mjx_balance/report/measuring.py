@@ -144,7 +144,7 @@ def _measure(
             controller = _controller(name, policy, scene)
             with progress(f"{name}, suite {suite}") as bar:
                 rollout = run_suite(
-                    scene, policy.config, controller, suite, scenarios, DURATION, SEEDS.report, bar
+                    scene, controller, suite, scenarios, DURATION, SEEDS.report, bar
                 )
             summary = summarize(rollout, suite, DURATION, SEEDS.report)
             results[name][suite] = suite_result(summary, suite)
@@ -153,7 +153,6 @@ def _measure(
     with progress("envelope") as bar:
         mapped = envelope(
             scene,
-            policy.config,
             observing(policy),
             ENVELOPE_SCENARIOS,
             ENVELOPE_DURATION,
@@ -184,8 +183,8 @@ def recorded(
     """
     scene = policy_scene(policy)
     chosen = _controller(controller, policy, scene)
-    return run_suite(scene, policy.config, chosen, suite, 1, duration, seed, record=True)
+    return run_suite(scene, chosen, suite, 1, duration, seed, record=True)
 
 
 def _controller(name: str, policy: Policy, scene: Scene) -> Controller:
-    return observing(policy) if name == "policy" else make_controller(name, scene, policy.config)
+    return observing(policy) if name == "policy" else make_controller(name, scene)

@@ -35,7 +35,7 @@ def check_fits(config: Config) -> None:
       ConfigError: with the estimate.
     """
     try:
-        evaluation.check_fits(config, config.eval_scenarios, config.eval_duration)
+        evaluation.check_fits(config.task, config.eval_scenarios, config.eval_duration)
     except evaluation.EvaluationError as error:
         raise ConfigError(f"eval_{error}") from error
 

@@ -115,7 +115,7 @@ def failing(tests: str) -> str | None:
         if done:
             code = os.waitstatus_to_exitcode(status)
             if code in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
-                raise SystemExit(f"pytest {tests} cannot run: exit code {code}")
+                raise RuntimeError(f"pytest {tests} cannot run: exit code {code}")
             if code == 0:
                 return None
             return witness.read_text() if witness.is_file() else "the import"
@@ -149,7 +149,7 @@ def caught(bug: Bug) -> str | None:
     path = own_copy() / bug.file
     whole = path.read_text()
     if whole.count(bug.old) != 1:
-        raise SystemExit(f"{bug.file}: {bug.old!r} occurs {whole.count(bug.old)} times, not once")
+        raise RuntimeError(f"{bug.file}: {bug.old!r} occurs {whole.count(bug.old)} times, not once")
     path.write_text(whole.replace(bug.old, bug.new))
     try:
         return failing(bug.tests)

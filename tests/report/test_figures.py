@@ -194,7 +194,7 @@ def made_up_rollout(
     tilt = np.full((1, steps), 0.25)
     tilt[0, :1_100] = 1.0
     rollout = Rollout(
-        config=config,
+        task=config.task,
         tilt=tilt,
         fell_at=np.array([fell_at]),
         action_mm=np.zeros((1, 110)),

@@ -45,13 +45,13 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
     """
     asked: list[tuple] = []
 
-    def run_suite(scene, config, controller, suite, scenarios, duration, seed, *more, **named):
+    def run_suite(scene, controller, suite, scenarios, duration, seed, *more, **named):
         tilt = np.tile([0.001 * (len(asked) + 1)] * 2 + [3.0, 6.0], (scenarios, 1))
         asked.append((controller, suite, scenarios, duration, seed, named.get("record", False)))
         fell_at = np.arange(scenarios) + 3  # the first falls in the last step
-        return Rollout(config, tilt, fell_at, np.zeros((scenarios, 1)), None, 1.0)
+        return Rollout(scene.config.task, tilt, fell_at, np.zeros((scenarios, 1)), None, 1.0)
 
-    def envelope(scene, config, controller, scenarios, duration, seed, *more):
+    def envelope(scene, controller, scenarios, duration, seed, *more):
         asked.append((controller, "envelope", scenarios, duration, seed, False))
         return dataclasses.replace(MAPPED, scenarios=scenarios, duration_s=duration, seed=seed)
 

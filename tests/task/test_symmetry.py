@@ -128,9 +128,9 @@ def test_the_robot_on_a_mirrored_board_sees_the_mirrored_world(
     rich: Config, robot: Robot, scene: Scene
 ) -> None:
     """3 s of random actions, observations and tilts to 1e-9: left-right is exact."""
-    config, group = rich, symmetries(rich.task, robot)
+    scene, group = dataclasses.replace(scene, config=rich), symmetries(rich.task, robot)
     which = mirror_of(group, (1, 0, 3, 2))
-    drawn, _ = make_scenarios(config, "paper", 2, 3.0, 0)
+    drawn, _ = make_scenarios(rich, "paper", 2, 3.0, 0)
     actions = np.random.default_rng(0).integers(0, 441, (15, 2))
 
     def run(scenario: Scenario, actions: np.ndarray, side: float) -> tuple[np.ndarray, Rollout]:
@@ -140,7 +140,7 @@ def test_the_robot_on_a_mirrored_board_sees_the_mirrored_world(
             seen.append(view.obs)
             return actions[view.decision]
 
-        rollout = roll_out(scene, config, act, scenario, 3.0, conditions=loaded(side))
+        rollout = roll_out(scene, act, scenario, 3.0, conditions=loaded(side))
         return np.asarray(seen), rollout
 
     seen, rollout = run(drawn, actions, 1.0)
