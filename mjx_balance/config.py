@@ -236,12 +236,14 @@ class Config:
     """Scenarios per suite of the evaluation after training."""
     eval_duration: float = bounded(60.0, above=0)
     """Length of each of them, s."""
+    engine: Literal["mjx", "mujoco"] = "mjx"
+    """Physics of the training: MJX, on any device, or MuJoCo's C engine, on CPUs."""
     robot: str = "quadruped"
     """The robot (robots/)."""
     solver_iterations: int = bounded(4, least=1, most=1_000)
-    """Newton iterations of a physics step in training. A batch waits for its slowest env, but
-    fewer do not converge when a random policy lifts a foot: with one, robots jump
-    (benchmarks/README.md)."""
+    """Newton iterations of a physics step of engine `mjx`; `mujoco` goes on until it has
+    converged. A batch waits for its slowest env, but fewer do not converge when a random policy
+    lifts a foot: with one, robots jump (benchmarks/README.md)."""
     line_search_iterations: int = bounded(6, least=1, most=1_000)
     """Line-search iterations of each of them."""
     task: TaskConfig = dataclasses.field(default_factory=TaskConfig)

@@ -1,6 +1,5 @@
 """`BalanceEnv`: one robot on one board, a brax environment with 441 discrete actions."""
 
-import functools
 from typing import Any
 
 import jax
@@ -8,8 +7,8 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State
 
 from mjx_balance.config import ACTION_AXES, Config, RandomizationConfig, check, preset
-from mjx_balance.engines.mjx import Engine, mjx_engine
-from mjx_balance.model_fields import model_fields
+from mjx_balance.engines import make_engine
+from mjx_balance.engines.engine import Engine, settled
 from mjx_balance.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.actions import action_table
@@ -22,7 +21,7 @@ from mjx_balance.task.symmetry import Symmetries, symmetries
 class BalanceEnv(Env):
     """A quadruped on a board that tilts in two axes (paper section 3).
 
-    One step is one decision: `sim_steps` physics steps of MJX. `done` is 1 after a
+    One step is one decision: `sim_steps` physics steps of the config's engine. `done` is 1 after a
     fall or at the time limit; `info["truncation"]` is 1 only at the time limit, so
     that `done * (1 - truncation)` marks true terminations. A done env is not reset
     by `step`: the observation it returns is the one before the reset.
@@ -41,12 +40,9 @@ class BalanceEnv(Env):
         """
         self.config = check(config or preset("default"))
         self.scene: Scene = load_scene(self.config)
+        self._engine: Engine = make_engine(self.scene)
         self._table = action_table(self.config.task)
         self._randomised = self.config.randomization != RandomizationConfig()
-
-    @functools.cached_property
-    def _engine(self) -> Engine:
-        return mjx_engine(self.scene)
 
     @property
     def observation_size(self) -> int:
@@ -69,7 +65,8 @@ class BalanceEnv(Env):
 
     @property
     def backend(self) -> str:
-        return "mjx"
+        """The physics engine."""
+        return self.config.engine
 
     def reset(self, rng: jax.Array) -> State:
         """Starts a fresh tilt scenario from the settled stance.
@@ -82,7 +79,7 @@ class BalanceEnv(Env):
         """
         task, robot = self.config.task, self.scene.robot
         rng, key_conditions, key_noise = jax.random.split(rng, 3)
-        physics = self._engine.initial
+        physics = settled(self.scene)
         memory = decision.start(task, robot, jnp.asarray(self.scene.stance.imu, jnp.float32))
         info = {
             "scenario": self._scenario(rng),
@@ -129,20 +126,18 @@ class BalanceEnv(Env):
         task, robot = self.config.task, self.scene.robot
         info: dict[str, Any] = state.info
         change = jnp.asarray(self._table)[action]
-        late, fields = None, {}
-        if self._randomised:
-            late = info["conditions"].latency > 0
-            fields = model_fields(self.scene, info["conditions"])
+        conditions = info.get("conditions")
+        late = None if conditions is None else conditions.latency > 0
         memory, targets = decision.controls(
             task, robot, info["memory"], change, late, info["scenario"], info["decision"]
         )
         before: Any = state.pipeline_state
-        moved, motion = self._engine.advance(before, self.scene.ctrl(targets), fields)
+        moved, motion = self._engine(before, self.scene.ctrl(targets), conditions)
         samples = motion.imu
-        if self._randomised:
+        if conditions is not None:
             key, key_noise = jax.random.split(info["noise_key"])
             noise = jax.random.normal(key_noise, samples.shape)
-            samples = samples + info["conditions"].imu_noise * noise
+            samples = samples + conditions.imu_noise * noise
             info = info | {"noise_key": key}
         angles = moved.qpos[self.scene.leg_qpos]
         memory, outcome = decision.outcome(task, robot, memory, samples, motion.tilt, angles)

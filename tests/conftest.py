@@ -19,7 +19,13 @@ from mjx_balance.scene import Scene, load_scene
 jax.config.update("jax_num_cpu_devices", 2)
 
 
-FLEET = ("test_engines", "test_env", "test_env_randomization", "test_stagger")
+FLEET = (
+    "test_engines",
+    "test_compiled_engine",
+    "test_env",
+    "test_env_randomization",
+    "test_stagger",
+)
 """Files that share the fixture `fleet`, which takes a minute to compile."""
 SLOW = ("test_run", "test_learning", *FLEET, "dqn")
 """Files and folders that begin first, so that the last of several processes is not left alone."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,9 +53,9 @@ def fleet_config() -> Config:
     return check(dataclasses.replace(default, task=task, randomization=RANDOM))
 
 
-def make_fleet() -> Fleet:
+def make_fleet(engine: Literal["mjx", "mujoco"] = "mjx") -> Fleet:
     """Compiles reset and step."""
-    env = BalanceEnv(fleet_config())
+    env = BalanceEnv(dataclasses.replace(fleet_config(), engine=engine))
     reset = jax.jit(jax.vmap(env.reset))
     step = jax.jit(jax.vmap(env.step)).lower(reset(keys(0)), jnp.zeros(ENVS, int))
     return Fleet(env, reset, step.compile(), step.as_text())

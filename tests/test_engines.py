@@ -4,6 +4,8 @@ import dataclasses
 import types
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from fleet import ENVS, EPISODE, Feedback, Fleet
 from mujoco import mjx
 
 from mjx_balance.config import Config
+from mjx_balance.engines.engine import settled
 from mjx_balance.engines.mjx import mjx_engine
 from mjx_balance.engines.mujoco import MujocoEngine
 from mjx_balance.evaluation import roll_out
@@ -164,12 +167,14 @@ def test_mjx_solves_as_the_config_says_and_leaves_the_scene_alone(
     monkeypatch.setattr(mjx, "put_model", put_model)
     config = dataclasses.replace(config, solver_iterations=7, line_search_iterations=9)
     engine = mjx_engine(dataclasses.replace(scene, config=config))
+    state, ctrl = settled(scene), jnp.zeros((1, scene.model.nu))
+    jax.eval_shape(lambda: engine(state, ctrl, None))
     assert seen == [(7, 9, 0.004)]
     assert scene.model.opt.iterations == 100
     assert scene.model.opt.ls_iterations == 50
     for name in ("qpos", "qvel", "qacc_warmstart"):
         stance = getattr(scene.stance, name)
-        np.testing.assert_allclose(getattr(engine.initial, name), stance, rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(getattr(state, name), stance, rtol=1e-6, atol=1e-7)
 
 
 def test_matrix_products_of_the_physics_are_exact(fleet: Fleet) -> None:

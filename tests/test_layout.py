@@ -25,8 +25,10 @@ FLOORS = (
     ),
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner"),
-    ("engines", "engines.mjx", "engines.mujoco", "controllers"),
-    ("env", "evaluation"),
+    ("engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
+    ("engines.mjx", "engines.compiled", "evaluation"),
+    ("engines",),
+    ("env",),
     ("render", "display", "report"),
     ("report.figures", "report.tables", "report.digest"),
     ("report.reading",),
@@ -46,7 +48,7 @@ WITHOUT_JAX = set(
     "evaluation statistics render report display".split()
 )
 """With everything in them."""
-WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}
+WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines.mujoco"}
 JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mjx_balance import env as env_module
 from mjx_balance.config import Config, preset
-from mjx_balance.engines.mjx import Engine, Motion, PhysicsState
+from mjx_balance.engines.engine import Engine, Motion, PhysicsState
 from mjx_balance.env import BalanceEnv
 from mjx_balance.evaluation import evaluate
 from mjx_balance.policy import Policy, make_manifest, save_policy
@@ -131,17 +131,12 @@ def test_actions_are_random_first_and_the_policys_later(run: Run) -> None:
 
 def still_engine(scene: Scene) -> Engine:
     """Physics in which nothing moves: what tracing needs of an engine."""
-    with jax.ensure_compile_time_eval():
-        stance = scene.stance
-        initial = PhysicsState(
-            *(jnp.asarray(x) for x in (stance.qpos, stance.qvel, stance.qacc_warmstart))
-        )
 
-    def advance(state: PhysicsState, ctrl: jax.Array, fields: Any) -> tuple[PhysicsState, Motion]:
+    def advance(state: PhysicsState, ctrl: jax.Array, _: Any) -> tuple[PhysicsState, Motion]:
         steps = len(ctrl)
         return state, Motion(jnp.tile(scene.stance.imu, (steps, 1)), jnp.zeros(steps))
 
-    return Engine(initial, advance)
+    return advance
 
 
 @pytest.mark.parametrize(
@@ -158,7 +153,7 @@ def test_every_presets_program_fits_its_state(
     monkeypatch: pytest.MonkeyPatch, name: str, seeds: int, kernels: list[tuple[int, ...]]
 ) -> None:
     """Traced whole, the physics left out: a state goes in, and one of the same shapes comes out."""
-    monkeypatch.setattr(env_module, "mjx_engine", still_engine)
+    monkeypatch.setattr(env_module, "make_engine", still_engine)
     config = size_to_device(dataclasses.replace(preset(name), num_seeds=seeds))
     learner = make_learner(config, BalanceEnv(config))
     before = jax.eval_shape(lambda: learner.init(0))

@@ -1,73 +1,34 @@
-"""MJX: advances one env by one decision inside a jitted program.
-
-An engine is an `Engine`. The state holds only what a physics step reads, so that it
-is cheap to carry, to reset and to save, and so that the environment need not know the
-engine behind it.
-"""
+"""MJX: physics inside a jitted program, on any device."""
 
 import copy
-from collections.abc import Callable
-from typing import NamedTuple
+import functools
 
 import jax
-import jax.numpy as jnp
 from mujoco import mjx
 
+from mjx_balance.engines.engine import Engine, Motion, PhysicsState
+from mjx_balance.model_fields import model_fields
 from mjx_balance.scene import Scene
 from mjx_balance.task.attitude import body_tilt
-
-
-class PhysicsState(NamedTuple):
-    """State of one env between physics steps."""
-
-    qpos: jax.Array
-    """(nq,)"""
-    qvel: jax.Array
-    """(nv,)"""
-    qacc_warmstart: jax.Array
-    """(nv,)"""
-
-
-class Motion(NamedTuple):
-    """What happened in one decision."""
-
-    imu: jax.Array
-    """(sim_steps, 6) gyro in rad/s and accelerometer in m/s^2, before each step."""
-    tilt: jax.Array
-    """(sim_steps,) body tilt after each step, deg."""
-
-
-Advance = Callable[[PhysicsState, jax.Array, dict[str, jax.Array]], tuple[PhysicsState, Motion]]
-"""(state, ctrl (sim_steps, nu), model fields that differ in this env) -> (state, motion)."""
-
-
-class Engine(NamedTuple):
-    """What an environment needs of a physics engine."""
-
-    initial: PhysicsState
-    """The settled stance."""
-    advance: Advance
-    """By one decision."""
+from mjx_balance.task.randomization import Conditions
 
 
 def mjx_engine(scene: Scene) -> Engine:
-    """Puts the scene's model on the device, with the solver settings of its config."""
-    training_model = copy.copy(scene.model)
-    training_model.opt.iterations = scene.config.solver_iterations
-    training_model.opt.ls_iterations = scene.config.line_search_iterations
-    with jax.ensure_compile_time_eval():  # constants, even where this runs inside a trace
-        model = mjx.put_model(training_model)
-        blank = mjx.make_data(training_model)
-        stance = scene.stance
-        initial = PhysicsState(
-            jnp.asarray(stance.qpos, jnp.float32),
-            jnp.asarray(stance.qvel, jnp.float32),
-            jnp.asarray(stance.qacc_warmstart, jnp.float32),
-        )
+    """Solves as the scene's config says; the model is put on the device when it is first traced."""
+
+    @functools.cache
+    def on_device() -> tuple[mjx.Model, mjx.Data]:
+        model = copy.copy(scene.model)
+        model.opt.iterations = scene.config.solver_iterations
+        model.opt.ls_iterations = scene.config.line_search_iterations
+        with jax.ensure_compile_time_eval():  # constants, though this runs inside a trace
+            return mjx.put_model(model), mjx.make_data(model)
 
     def advance(
-        state: PhysicsState, ctrl: jax.Array, fields: dict[str, jax.Array]
+        state: PhysicsState, ctrl: jax.Array, conditions: Conditions | None
     ) -> tuple[PhysicsState, Motion]:
+        fields = {} if conditions is None else model_fields(scene, conditions)
+        model, blank = on_device()
         env_model = model.replace(**fields)
 
         def physics_step(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Motion]:
@@ -81,4 +42,4 @@ def mjx_engine(scene: Scene) -> Engine:
 
         return jax.lax.scan(physics_step, state, ctrl)
 
-    return Engine(initial, advance)
+    return advance

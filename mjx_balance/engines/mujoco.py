@@ -15,6 +15,13 @@ from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.randomization import Conditions
 
 
+def cores() -> int:
+    """CPU cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 class Motion(NamedTuple):
     """What happened in one decision of n scenarios."""
 
@@ -47,14 +54,27 @@ class MujocoEngine:
           threads: worker threads; all cores if none.
         """
         self.scene = scene
-        self._batch = Batch(scene.model, count, threads or os.cpu_count() or 1)
+        self._batch = Batch(scene.model, count, threads or cores())
         if conditions is not None:
-            for name, values in model_fields(scene, conditions).items():
-                self._batch.expand(name)[...] = values
-            self._batch.set_const()
-        self._batch.qpos = scene.stance.qpos
-        self._batch.qvel = scene.stance.qvel
-        self._batch.qacc_warmstart = scene.stance.qacc_warmstart
+            self.vary(np.arange(count), conditions)
+        stance = scene.stance
+        self.place(stance.qpos, stance.qvel, stance.qacc_warmstart)
+
+    def vary(self, ids: np.ndarray, conditions: Conditions) -> None:
+        """Puts scenarios `ids` (n,) into other circumstances (n,)."""
+        for name, values in model_fields(self.scene, conditions).items():
+            self._batch.expand(name)[ids] = values
+        self._batch.set_const(ids)
+
+    def place(self, qpos: np.ndarray, qvel: np.ndarray, qacc_warmstart: np.ndarray) -> None:
+        """Puts all scenarios into states (count, nq), (count, nv), (count, nv), or into one."""
+        self._batch.qpos, self._batch.qvel = qpos, qvel
+        self._batch.qacc_warmstart = qacc_warmstart
+        self._batch.warning[...] = 0
+
+    def whole_state(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What `place` takes, of all scenarios."""
+        return self._batch.qpos, self._batch.qvel, self._batch.qacc_warmstart
 
     def state(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions (n, nq) and velocities (n, nv) of scenarios `ids` (n,)."""

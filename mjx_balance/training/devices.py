@@ -39,6 +39,11 @@ def size_to_device(config: Config) -> Config:
     """
     available = jax.devices()
     on_cpu = available[0].platform == "cpu"
+    if config.engine == "mujoco" and not on_cpu:
+        raise ConfigError(
+            f"engine is mujoco, which runs on CPUs, and JAX uses {available[0].device_kind}; set "
+            "JAX_PLATFORMS=cpu, or choose engine mjx"
+        )
     num_envs, batch_size = config.num_envs, config.dqn.batch_size
     if num_envs is None:
         num_envs = CPU_ENVS if on_cpu else ACCELERATOR_ENVS
