@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State
 
 from mjx_balance.config import ACTION_AXES, Config, RandomizationConfig, check, preset
-from mjx_balance.engines import make_engine
+from mjx_balance.engines.choice import make_engine
 from mjx_balance.engines.engine import Engine, settled
 from mjx_balance.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt

@@ -22,7 +22,8 @@ from fleet import (
 )
 
 from mjx_balance.config import preset
-from mjx_balance.engines import ffi, make_engine
+from mjx_balance.engines import ffi
+from mjx_balance.engines.choice import make_engine
 from mjx_balance.engines.compiled import VARIED
 from mjx_balance.engines.engine import Engine, PhysicsState, settled
 from mjx_balance.engines.mujoco import MujocoEngine

@@ -25,9 +25,9 @@ FLOORS = (
     ),
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner"),
-    ("engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
+    ("engines", "engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
     ("engines.mjx", "engines.compiled", "evaluation"),
-    ("engines",),
+    ("engines.choice",),
     ("env",),
     ("render", "display", "report"),
     ("report.figures", "report.tables", "report.digest"),
@@ -48,7 +48,7 @@ WITHOUT_JAX = set(
     "evaluation statistics render report display".split()
 )
 """With everything in them."""
-WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines.mujoco"}
+WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}
 JAX = {"jax", "jaxlib", "flax", "brax", "optax", "orbax"}
 
 

@@ -107,6 +107,16 @@ def test_another_structure_is_refused(folder: Path, other: object) -> None:
         restore(folder, other, lambda said: None)
 
 
+def test_no_file_may_change_its_name(two: Path, tmp_path: Path) -> None:
+    for path in sorted((two / "10").rglob("*")):
+        if path.is_file():
+            shutil.copytree(two, tmp_path / "folder")
+            copied = tmp_path / "folder" / path.relative_to(two)
+            copied.rename(copied.with_name(f"{path.name}~"))  # sorted as before
+            assert restored(tmp_path / "folder") == 5, path
+            shutil.rmtree(tmp_path / "folder")
+
+
 @settings(deadline=None, max_examples=60)
 @given(data=st.data())
 def test_any_damage_is_found_out(
