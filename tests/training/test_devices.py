@@ -37,6 +37,14 @@ def test_an_accelerator_gets_2048(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (sized.num_envs, sized.num_devices) == (2048, 1)
 
 
+def test_the_c_engine_is_refused_where_jax_has_no_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu = types.SimpleNamespace(platform="gpu", device_kind="NVIDIA H100")
+    monkeypatch.setattr(jax, "devices", lambda: [gpu])
+    said = "engine is mujoco, which runs on CPUs, and JAX uses NVIDIA H100; set JAX_PLATFORMS=cpu"
+    with pytest.raises(ConfigError, match=said):
+        size_to_device(dataclasses.replace(CONFIG, engine="mujoco"))
+
+
 @pytest.mark.parametrize(
     ("num_envs", "batch_size", "available", "expected"),
     [(64, 512, 8, 8), (60, 512, 8, 4), (64, 510, 8, 2), (63, 512, 8, 1), (6, 9, 4, 3)],

@@ -20,7 +20,7 @@ from mjx_balance.training.checkpoints import saved_steps
 
 REPO = Path(__file__).parents[2]
 FLAGS = (
-    "--preset smoke --num-env-steps 6144 --eval-scenarios 8 --eval-duration 10 "
+    "--preset smoke --engine mujoco --num-env-steps 6144 --eval-scenarios 8 --eval-duration 10 "
     "--checkpoint-seconds 1"
 ).split()
 PATIENCE_S = 300.0
