@@ -28,6 +28,7 @@ from throughput import hardware
 
 from mjx_balance.dqn import replay
 from mjx_balance.dqn.replay import Transition
+from mjx_balance.quiet import quiet_imports
 
 CAPACITY, BATCH = 131_072, 512
 OBS_SIZES, NUM_ENVS = (34, 136), (256, 1024)
@@ -50,8 +51,9 @@ class Buffer(NamedTuple):
 
 def buffers(obs_size: int, num_envs: int) -> dict[str, Buffer]:
     """The contenders, for transitions of one size."""
-    import flashbax
-    from brax.training.replay_buffers import UniformSamplingQueue
+    with quiet_imports():
+        import flashbax  # pyright: ignore[reportMissingImports]
+        from brax.training.replay_buffers import UniformSamplingQueue
 
     obs, scalar = jnp.zeros(obs_size), jnp.float32(0)
     example = Transition(obs, jnp.int32(0), scalar, scalar, obs)
@@ -183,7 +185,9 @@ def main() -> int:
         print("measuring {} inputs, {} envs, {}:1 ...".format(*shape), file=sys.stderr, flush=True)
         rows += measure(*shape, args.rounds)
         if args.json:
-            args.json.write_text(json.dumps({"hardware": hardware(), "rows": rows}, indent=2) + "\n")
+            args.json.write_text(
+                json.dumps({"hardware": hardware(), "rows": rows}, indent=2) + "\n"
+            )
     names = list(rows[0]["microseconds"])
     lines = [
         [

@@ -25,13 +25,15 @@ from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names
 
 HIDDEN = (256, 256)
+EXPLORE = 20_000
+"""Decisions in which epsilon falls to its end, however long the run may be."""
 
 
 def peer_config(seed: int) -> Config:
     """The task of preset `default`, and the network as the policy file has to know it."""
     default = preset("default")
     dqn = dataclasses.replace(default.dqn, head="joint", hidden_sizes=HIDDEN)
-    return dataclasses.replace(default, seed=seed, dqn=dqn)
+    return dataclasses.replace(default, seed=seed, engine="mujoco", dqn=dqn)
 
 
 def draw_scenario(task: TaskConfig, rng: np.random.Generator) -> tilt.Scenario:
@@ -52,14 +54,15 @@ class Board:
         """Nothing moves before `reset`."""
         self.scene, self.task = scene, scene.config.task
         self.table = action_table(self.task)
+        self.engine = MujocoEngine(scene, 1, threads=1)
 
     def reset(self, scenario: tilt.Scenario) -> np.ndarray:
         """Starts from the settled stance; returns the observation (obs_size,)."""
-        scene = self.scene
-        self.engine = MujocoEngine(scene, 1, threads=1)
+        scene, stance = self.scene, self.scene.stance
+        self.engine.place(stance.qpos, stance.qvel, stance.qacc_warmstart)
         self.scenario, self.decisions = scenario, 0
-        self.memory = decision.start(self.task, scene.robot, scene.stance.imu[None])
-        angles = scene.stance.qpos[None, scene.leg_qpos]
+        self.memory = decision.start(self.task, scene.robot, stance.imu[None])
+        angles = stance.qpos[None, scene.leg_qpos]
         obs = decision.observation(self.task, scene.robot, self.memory, angles)
         return obs[0].astype(np.float32)
 
@@ -109,10 +112,10 @@ def to_policy(
 
 def train(folder: Path, decisions: int, every: int, seed: int) -> None:
     """Trains, with a policy `DECISIONS.safetensors` after each `every` decisions."""
-    import gymnasium
-    import torch
-    from stable_baselines3 import DQN
-    from stable_baselines3.common.callbacks import BaseCallback
+    import gymnasium  # pyright: ignore[reportMissingImports]
+    import torch  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import DQN  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
 
     config = peer_config(seed)
     scene = load_scene(config)
@@ -154,7 +157,7 @@ def train(folder: Path, decisions: int, every: int, seed: int) -> None:
         train_freq=4,
         gradient_steps=1,
         target_update_interval=1_000,
-        exploration_fraction=0.1,
+        exploration_fraction=min(1.0, EXPLORE / decisions),
         exploration_final_eps=0.05,
         policy_kwargs={"net_arch": list(HIDDEN)},
         seed=seed,
