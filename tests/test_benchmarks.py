@@ -1,6 +1,8 @@
 """The benchmark scripts still fit the package: they are run by hand, so nothing else would say."""
 
+import dataclasses
 import importlib.util
+import itertools
 import json
 import runpy
 import sys
@@ -9,15 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
 
-from mjx_balance.config import DQNConfig
+from mjx_balance.config import DQNConfig, TaskConfig
+from mjx_balance.controllers import View
 from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
-from mjx_balance.evaluation import Rollout
+from mjx_balance.evaluation import Rollout, roll_out
 from mjx_balance.policy import load_policy
+from mjx_balance.scene import load_scene
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SCRIPTS = sorted(
@@ -49,15 +54,21 @@ def test_the_env_that_throughput_times_moves_on_every_device() -> None:
     assert (np.asarray(after.obs) != seen).all()
 
 
-@pytest.fixture
-def results(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
-    """`benchmarks/results.py`; its simulation gives 0.1 deg everywhere and counts its calls."""
+def load(name: str, monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """A benchmark script as a module, not run."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    spec = importlib.util.spec_from_file_location("results", BENCHMARKS / "results.py")
+    spec = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def results(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """`benchmarks/results.py`; its simulation gives 0.1 deg everywhere and counts its calls."""
+    module = load("results", monkeypatch)
     module.asked, module.tilt = [], 0.1
 
     def run_suite(scene, controller, suite, scenarios, *more):
@@ -104,3 +115,296 @@ def test_published_results_stand_while_the_code_gives_them(
     result(4)
     assert results.asked == [4], "as few as are tried: measured at once"
     assert len(json.loads((tmp_path / "r.json").read_text())) == 2
+
+
+@pytest.fixture
+def sb3(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """`benchmarks/sb3_dqn.py`, whose env needs neither Gymnasium nor torch."""
+    return load("sb3_dqn", monkeypatch)
+
+
+def rewards_by_hand(tilts: np.ndarray) -> np.ndarray:
+    """What decisions of tilts (n, 50), deg, earn: level, and 1 for 2.5 deg less than before."""
+    mean = tilts.mean(axis=-1)
+    before = np.concatenate(([0.0], mean[:-1]))
+    return 0.4 * np.exp(-1.5 * mean) + np.clip((before - mean) / 2.5, -1, 1)
+
+
+@pytest.mark.parametrize("falls", [False, True])
+def test_the_peers_env_is_the_task_of_the_evaluation(sb3: types.ModuleType, falls: bool) -> None:
+    scene = load_scene(sb3.peer_config(0))
+    rng = np.random.default_rng(5)
+    scenario = sb3.draw_scenario(scene.config.task, rng)
+    # Ten levels up on both axes, or a little to and fro.
+    actions = np.full(60, 440) if falls else 220 + rng.integers(-2, 3, 60) * 22
+    seen = []
+
+    def recorded(view: View) -> np.ndarray:
+        seen.append(view.obs[0])
+        return actions[[view.decision]]
+
+    rollout = roll_out(scene, recorded, scenario, 12.0)
+    board = sb3.Board(scene)
+    for _ in range(2):  # the second time after a reset on the way
+        obs, rewards, fell = [board.reset(scenario)], [], False
+        while not fell and len(rewards) < 60:
+            shown, reward, fell, late, _ = board.step(int(actions[len(rewards)]))
+            assert not late
+            obs.append(shown)
+            rewards.append(reward)
+        assert fell == falls == rollout.fell[0]
+        made = len(seen)
+        assert len(rewards) == made
+        np.testing.assert_allclose(obs[:made], seen, atol=1e-5)
+        by_hand = rewards_by_hand(rollout.tilt.reshape(60, 50)[:made])
+        # After a fall the rollout's tilts are 6 deg, the env's what they were: not compared.
+        np.testing.assert_allclose(rewards[: made - falls], by_hand[: made - falls], atol=1e-6)
+        if falls:
+            assert -1.5 <= rewards[-1] < -0.5
+            assert made < 20
+
+
+def test_the_peers_env_runs_out_of_time(sb3: types.ModuleType) -> None:
+    config = sb3.peer_config(0)
+    task = dataclasses.replace(config.task, episode_length=3)
+    scene = load_scene(dataclasses.replace(config, task=task))
+    board = sb3.Board(scene)
+    for _ in range(2):
+        board.reset(sb3.draw_scenario(task, np.random.default_rng(0)))
+        assert [board.step(220)[2:4] for _ in range(3)] == [
+            (False, x) for x in (False, False, True)
+        ]
+
+
+@pytest.mark.parametrize(("share", "square"), [(0.0, 49 / 6), (1.0, 49 / 3), (0.5, 49 / 4)])
+def test_the_peers_boards_are_those_of_training(
+    sb3: types.ModuleType, share: float, square: float
+) -> None:
+    rng = np.random.default_rng(0)
+    drawn = [sb3.draw_scenario(TaskConfig(square_share=share), rng) for _ in range(1500)]
+    targets = np.concatenate([scenario.targets for scenario in drawn])
+    assert targets.shape == (1500, 7, 2)  # 60 s, whatever the phase
+    assert not targets[:, 0].any()
+    # x^2 of a disc's uniform radius of 7 deg: 49 / 3 / 2; of a square's side: 49 / 3.
+    assert (targets[:, 1:] ** 2).mean() == pytest.approx(square, rel=0.04)
+    np.testing.assert_allclose(targets[:, 1:].mean(axis=(0, 1)), 0, atol=0.2)
+    assert (np.hypot(*targets.T).max() > 7.001) == (share > 0)
+    phase = np.concatenate([scenario.phase for scenario in drawn])
+    assert phase.min() >= 0
+    assert 9.9 < phase.max() < 10
+    assert {float(scenario.rate[0]) for scenario in drawn} == {3.5}
+
+
+def test_the_peers_network_becomes_a_policy(sb3: types.ModuleType, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    sizes = (34, 256, 256, 441)
+    layers = {}
+    for k, (rows, columns) in enumerate(itertools.pairwise(sizes)):
+        layers[f"q_net.{2 * k}.weight"] = rng.normal(size=(columns, rows)).astype(np.float32)
+        layers[f"q_net.{2 * k}.bias"] = rng.normal(size=columns).astype(np.float32)
+    sb3.to_policy(tmp_path / "p.safetensors", layers, sb3.peer_config(0), "scene", 700)
+    policy = load_policy(tmp_path / "p.safetensors")
+    obs = rng.normal(size=34).astype(np.float32)
+    x = obs
+    for k in range(3):
+        x = layers[f"q_net.{2 * k}.weight"] @ x + layers[f"q_net.{2 * k}.bias"]
+        x = x if k == 2 else x * (x > 0)
+    np.testing.assert_allclose(policy.q_values(obs), x, rtol=1e-4, atol=1e-2)
+    assert policy.manifest["training"]["env_steps"] == 700
+
+
+@pytest.fixture
+def timing(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """`benchmarks/time_to_balance.py`; every look at its clock takes a second, judging 100."""
+    module = load("time_to_balance", monkeypatch)
+    module.now, module.verdicts = 0.0, {}
+
+    def look() -> float:
+        module.now += 1
+        return module.now
+
+    def judged(policy: Path, suite: str, display: Any) -> dict[str, Any]:
+        module.now += 100
+        mean, falls = module.verdicts.get(policy.stem, (0.1, 0))
+        return {"mean": mean if suite == "paper" else 3.0, "falls": falls}
+
+    clock = types.SimpleNamespace(perf_counter=look, sleep=lambda seconds: None)
+    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(module, "judged", judged)
+    return module
+
+
+PRETENDED = """
+import pathlib, sys
+for k in range(10, 50, 10):
+    pathlib.Path(sys.argv[1], f"{k}.safetensors").touch()
+    print(k, flush=True)
+    if not sys.stdin.readline():
+        break
+"""
+
+
+def test_the_peer_is_timed_to_the_first_checkpoint_that_passes(
+    timing: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sb3_dqn.py").write_text(PRETENDED)
+    monkeypatch.setattr(timing, "HERE", tmp_path)
+    timing.verdicts = {"10": (0.1, 1), "20": (0.21, 0), "30": (0.2, 0)}
+    row = timing.peer(40, 10, 0.2, tmp_path, timing.Display())
+    assert row == {
+        "contender": "sb3",
+        "engine": "mujoco",
+        "start": "cold",
+        "seconds": 3.0,  # one for each stretch of training, none of the judging
+        "decisions": 30,
+        "paper": {"mean": 0.2, "falls": 0},
+        "corner": {"mean": 3.0, "falls": 0},
+    }
+    assert not (tmp_path / "40.safetensors").exists()
+    never = timing.peer(20, 10, 0.01, tmp_path, timing.Display())
+    assert (never["seconds"], never["decisions"]) == (None, 20)
+    with pytest.raises(timing.Failed, match="ended after 40 decisions"):
+        timing.peer(100, 10, 0.01, tmp_path, timing.Display())
+
+
+def test_our_clock_stops_when_the_policy_is_there(timing: types.ModuleType, tmp_path: Path) -> None:
+    script = (
+        (
+            "import os, pathlib, time; p = pathlib.Path('part');"
+            "p.write_text(os.environ['MJX_BALANCE_CACHE']); p.rename('file'); time.sleep(600)"
+        )
+        .replace("'part'", repr(str(tmp_path / "part")))
+        .replace("'file'", repr(str(tmp_path / "file")))
+    )
+    assert timing.time_to_file([sys.executable, "-c", script], tmp_path / "file", tmp_path) == 1
+    assert (tmp_path / "file").read_text() == str(tmp_path)
+    with pytest.raises(timing.Failed, match="exit code 3"):
+        timing.time_to_file([sys.executable, "-c", "exit(3)"], tmp_path / "none", tmp_path)
+
+
+def test_a_warm_start_is_the_same_again(
+    timing: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = BENCHMARKS.parent / "policies" / "best.safetensors"
+    asked = []
+
+    def time_to_file(command: list[str], file: Path, cache: Path) -> float:
+        asked.append((" ".join(command[1:-1]), cache, cache.exists()))
+        cache.mkdir(exist_ok=True)
+        file.parent.mkdir()
+        file.write_bytes(shipped.read_bytes())
+        return 30.0 - 10 * len(asked)
+
+    monkeypatch.setattr(timing, "time_to_file", time_to_file)
+    rows = [
+        row
+        for engine in ("mjx", "mujoco")
+        for row in timing.ours(engine, 640, tmp_path, timing.Display())
+    ]
+    assert [(row["engine"], row["start"]) for row in rows] == [
+        *(("mjx", "cold"), ("mjx", "warm")),
+        *(("mujoco", "cold"), ("mujoco", "warm")),
+    ]
+    assert [existed for _, _, existed in asked] == [False, True, False, True]
+    assert asked[0] == (*asked[1][:2], False)
+    assert "train.py --engine mjx --num-env-steps 640 --run-dir" in asked[0][0]
+    trained = load_policy(shipped).manifest["training"]["env_steps"]
+    assert rows[0] == {
+        "contender": "mjx",
+        "engine": "mjx",
+        "start": "cold",
+        "seconds": 20.0,
+        "decisions": trained,
+        "paper": {"mean": 0.1, "falls": 0},
+        "corner": {"mean": 3.0, "falls": 0},
+    }
+
+
+def test_the_ratio_is_the_peers_time_over_ours(timing: types.ModuleType) -> None:
+    tilts = {"paper": {"mean": 0.1, "falls": 0}, "corner": {"mean": 0.25, "falls": 7}}
+    mine = {"contender": "mujoco", "start": "warm", "seconds": 24.0, "decisions": 20224} | tilts
+    other = {"contender": "sb3", "start": "cold", "seconds": 300.0, "decisions": 75000} | tilts
+    machine = {"cpu": "a CPU", "cores": 2}
+
+    def last(*rows: dict[str, Any]) -> list[str]:
+        lines = timing.lines_of(list(rows), 0.2, machine)
+        return [line.split(" | ")[-1] for line in lines if line.startswith("| `m")]
+
+    line = timing.lines_of([mine, other], 0.2, machine)[2]
+    assert line == "| `mujoco` | warm | 24.0 | 20,224 | 0.100 (0) | 0.250 (7) | 12.5 |"
+    assert last(mine) == last(mine, other | {"seconds": None}) == ["- |"]
+
+
+def test_without_the_peer_nothing_is_started(
+    timing: types.ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    kept = tmp_path / "old.json"
+    kept.write_text("[]")
+    monkeypatch.setattr(timing.importlib.util, "find_spec", lambda name: None)
+    for flags in ([], ["--contenders", "sb3"]):
+        monkeypatch.setattr(sys, "argv", ["time_to_balance.py", "--json", str(kept), *flags])
+        assert timing.main() == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "--contenders mujoco mjx" in said
+    assert kept.read_text() == "[]"
+
+
+def test_what_is_measured_is_kept_when_a_contender_fails(
+    timing: types.ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    row = {"contender": "mujoco", "start": "cold", "seconds": 24.0, "decisions": 20224}
+    row |= {"paper": {"mean": 0.1, "falls": 0}, "corner": {"mean": 0.2, "falls": 0}}
+
+    ends: list[BaseException] = [KeyboardInterrupt(), timing.Failed("mjx gave up")]
+
+    def ours(engine: str, *more: Any):
+        if engine == "mjx":
+            raise ends.pop()
+        yield row
+
+    file, page = tmp_path / "t.json", tmp_path / "page.md"
+    monkeypatch.setattr(timing, "ours", ours)
+    flags = f"--contenders mujoco mjx --json {file} --write {page}".split()
+    monkeypatch.setattr(sys, "argv", ["time_to_balance.py", *flags])
+    for code in (2, 130):
+        file.unlink(missing_ok=True)
+        assert timing.main() == code
+        assert json.loads(file.read_text())["rows"] == [row]
+        assert "| 24.0 |" in capsys.readouterr().out
+    assert not page.exists()
+
+
+def counting(work: int) -> Any:
+    """A pretended buffer for `benchmarks/replay.py`: (adds, samples), and some work."""
+    one = jnp.zeros(1)
+
+    def sample(state: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+        spent = jax.lax.fori_loop(0, work, lambda k, x: jnp.sin(x + k), 0.1 * state.sum())
+        return state + jnp.asarray((0, 1)) + (0 * spent).astype(int), one
+
+    return types.SimpleNamespace(
+        init=lambda: jnp.zeros(2, int),
+        add=lambda state, batch: state + jnp.asarray((1, 0)),
+        sample=sample,
+    )
+
+
+def test_replay_compares_as_many_adds_and_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = load("replay", monkeypatch)
+    run = module.program(counting(1), lambda number: None, 8, 3)
+    state, _ = run(jnp.zeros(2, int), jax.random.PRNGKey(0))
+    assert state.tolist() == [8, 24]
+    fast, slow = counting(1), counting(100_000)
+    monkeypatch.setattr(module, "buffers", lambda *size: {"ours": fast, "a": slow, "b": fast})
+    assert {row["best_other"] for row in module.measure(1, 256, 1, 3)} == {"b"}
+    monkeypatch.setattr(module, "buffers", lambda *size: {"ours": slow, "a": fast})
+    rows = module.measure(1, 256, 1, 3)
+    assert [row["buffer"] for row in rows] == ["filling", "full"]
+    assert all(row["ours_over_best_other"] < 0.5 for row in rows)
