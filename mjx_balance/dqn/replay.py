@@ -90,4 +90,4 @@ def sample(state: ReplayState, key: jax.Array, batch_size: int) -> Transition:
       (batch_size, ...) per field.
     """
     rows = jax.random.randint(key, (batch_size,), 0, state.size)
-    return jax.tree.map(lambda ring: ring[rows], state.data)
+    return jax.tree.map(lambda ring: ring.at[rows].get(mode="promise_in_bounds"), state.data)
