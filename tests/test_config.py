@@ -119,7 +119,7 @@ def test_preset_smoke_is_the_default_made_small() -> None:
     assert (smoke.eval_scenarios, smoke.eval_duration) == (16, 20.0)
     assert (smoke.eval_every, smoke.validation_scenarios, smoke.validation_duration) == (
         4_096,
-        4,
+        2,
         10.0,
     )
     assert smoke.dqn.head == default.dqn.head

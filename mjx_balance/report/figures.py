@@ -135,6 +135,7 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
         if name == "train/tilt_deg":
             axis.yaxis.set_major_formatter("{x:g}")
             axis.yaxis.set_minor_formatter("{x:g}")
+            axis.yaxis.set_minor_locator(mpl.ticker.LogLocator(subs=(2, 5)))
             _draw_held_out(axis, runs)
         if scale in ("linear", "symlog") and name != "train/reward":
             axis.set_ylim(bottom=0)

@@ -89,7 +89,7 @@ def test_an_evaluation_beyond_the_memory_is_refused_by_its_field() -> None:
         finish.check_fits(dataclasses.replace(CONFIG, eval_duration=1e12))
     with pytest.raises(ConfigError, match="validation_scenarios is 100000000 and duration 10 s:"):
         finish.check_fits(dataclasses.replace(CONFIG, validation_scenarios=100_000_000))
-    with pytest.raises(ConfigError, match="validation_scenarios is 4 and duration 1e"):
+    with pytest.raises(ConfigError, match="validation_scenarios is 2 and duration 1e"):
         finish.check_fits(dataclasses.replace(CONFIG, validation_duration=1e12))
 
 
