@@ -1,8 +1,8 @@
 """Does a run survive being killed at any moment?
 
 Trains a small run to its end, then the same run again and again with `kill -9` at a random
-moment between the making of its folder and its end, resumed until it is finished. The policy
-must be that of the undisturbed run, bit for bit. Prints a table.
+moment between the making of its folder and its end, resumed until it is finished. The policy,
+the best of six validated ones, must be that of the undisturbed run, bit for bit. Prints a table.
 
     python benchmarks/kills.py [--kills 20] [--seed 0]
 """
@@ -23,7 +23,7 @@ from mjx_balance.training.checkpoints import saved_steps
 REPO = Path(__file__).resolve().parent.parent
 FLAGS = (
     "--preset smoke --num-env-steps 3072 --eval-scenarios 4 --eval-duration 5 "
-    "--log-every 512 --checkpoint-seconds 1"
+    "--log-every 512 --checkpoint-seconds 1 --eval-every 512 --export best"
 ).split()
 LIMIT_S = 600.0
 

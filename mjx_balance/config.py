@@ -232,6 +232,15 @@ class Config:
     """Env steps between two lines of metrics."""
     checkpoint_seconds: float = bounded(45.0, above=0)
     """Time between two checkpoints, s."""
+    eval_every: int = bounded(20_000, least=0)
+    """Env steps between two validations of the greedy policy during training, in whole calls of
+    `log_every`; the end of the run is validated too. 0: never."""
+    validation_scenarios: int = bounded(6, least=1)
+    """Scenarios per suite of each of them (chosen: they take less than 5% of a run)."""
+    validation_duration: float = bounded(20.0, above=0)
+    """Length of each of these scenarios, s."""
+    export: Literal["last", "best"] = "last"
+    """Which policy the run hands out: that of its end, or the one that validated best."""
     eval_scenarios: int = bounded(128, least=1)
     """Scenarios per suite of the evaluation after training."""
     eval_duration: float = bounded(60.0, above=0)
@@ -295,6 +304,9 @@ PRESETS: Mapping[str, Config] = {
         num_envs=64,
         num_env_steps=8_192,
         log_every=1_024,
+        eval_every=4_096,
+        validation_scenarios=2,
+        validation_duration=10.0,
         eval_scenarios=16,
         eval_duration=20.0,
         task=_TASK,
@@ -341,6 +353,11 @@ def check(config: Config) -> Config:
     _check_timing(config.task)
     _check_reach(config.task, robot)
     _check_learning(config)
+    if config.export == "best" and not config.eval_every:
+        raise ConfigError(
+            "export is 'best', but eval_every is 0, so that nothing is validated to choose from; "
+            "eval_every must be at least 1, or export last"
+        )
     least, most = config.randomization.friction_min, config.randomization.friction_max
     if (most or robot.foot_friction) < (least or robot.foot_friction):
         raise ConfigError(

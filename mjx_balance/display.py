@@ -19,6 +19,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from mjx_balance.suites import HEADLINE
+
 PLAIN_INTERVAL = 5.0
 """Seconds between two plain lines."""
 
@@ -88,13 +90,14 @@ class Display:
         self._progress = None
 
     def update(self, done: int, metrics: Mapping[str, float]) -> None:
-        """Shows new numbers.
+        """Shows new numbers, and those of the last validation until there is another.
 
         Args:
           done: decisions so far.
           metrics: by their logged names.
         """
-        self._metrics = metrics
+        held_out = {k: v for k, v in self._metrics.items() if k.startswith("eval/")}
+        self._metrics = {**held_out, **metrics}
         if self._progress is not None:
             self._progress.update(self._task, completed=min(done, self._total))
             self._live.update(self._panel())
@@ -128,7 +131,18 @@ class Display:
             for name, (label, text) in SHOWN.items()
             if name in self._metrics
         ]
-        return "  ".join([*cells, *self._warnings()])
+        validated = [f"{label} {value}" for label, value in self._validated()]
+        return "  ".join([*cells, *validated, *self._warnings()])
+
+    def _validated(self) -> list[tuple[str, str]]:
+        """Label and value of each validated suite, once there are any."""
+        found = []
+        for suite in HEADLINE:
+            tilt = self._metrics.get(f"eval/{suite}/tilt_mean")
+            falls = self._metrics.get(f"eval/{suite}/falls")
+            if tilt is not None and falls is not None:
+                found.append((f"held out, {suite}", f"{tilt:.3f} deg, falls {falls:g}"))
+        return found
 
     def _warnings(self) -> list[str]:
         """What should not be, where it is."""
@@ -148,11 +162,11 @@ class Display:
             cells += [f"[dim]{label}[/dim]", f"[bold]{value}[/bold]"]
         grid.add_row(*cells[:6])
         grid.add_row(*cells[6:])
-        warnings = [f"[bold red]{warning}[/bold red]" for warning in self._warnings()]
+        validated = [f"[dim]{x}[/dim]   [bold]{y}[/bold]" for x, y in self._validated()]
+        below = ["   ".join(validated)] if validated else []
+        below += [f"[bold red]{warning}[/bold red]" for warning in self._warnings()]
         assert self._progress is not None
-        return Panel(
-            Group(self._progress, grid, *warnings), title="mjx_balance", border_style="cyan"
-        )
+        return Panel(Group(self._progress, grid, *below), title="mjx_balance", border_style="cyan")
 
 
 class Bar:

@@ -64,6 +64,15 @@ class RunFolder:
         return self.path / "checkpoints"
 
     @property
+    def validated(self) -> Path:
+        """The policies validated during training, in folders named by the decisions made."""
+        return self.path / "validated"
+
+    def validated_policy(self, seed: int, env_steps: int) -> Path:
+        """The policy of a seed after so many decisions."""
+        return self.validated / str(env_steps) / f"seed-{seed}.safetensors"
+
+    @property
     def seeds_summary(self) -> Path:
         """Evaluation, validation and choice among several seeds."""
         return self.path / "seeds.json"
@@ -278,3 +287,10 @@ def keep_metrics_until(path: Path, env_steps: int) -> None:
             if json.loads(text)["env_steps"] <= env_steps:
                 kept.append(f"{text}\n")
     write_atomically(path, "".join(kept))
+
+
+def keep_validated_until(directory: Path, env_steps: int) -> None:
+    """Drops the policies that a resumed run will validate again, as `keep_metrics_until`."""
+    for path in directory.glob("*"):
+        if path.name.isdecimal() and int(path.name) > env_steps:
+            shutil.rmtree(path)

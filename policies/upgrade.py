@@ -29,6 +29,7 @@ def upgraded_config(old: dict[str, Any]) -> Config:
     """Translates the config of a format-2 manifest."""
     values = {name: value for name, value in old.items() if name not in ("robot", "random")}
     del values["checkpoint_every"]
+    values["eval_every"] = 0  # 0.1 did not validate during training
     values["randomization"] = {k: v for k, v in old["random"].items() if k not in IDLE}
     if any(old["random"][name] is not None for name in IDLE):
         raise ValueError(f"{' or '.join(IDLE)} is set; this release has no such field")

@@ -76,6 +76,8 @@ def test_chosen_numbers_are_those_that_the_benchmarks_were_made_with() -> None:
         assert dqn.replay_capacity == 2**17
         assert (dqn.epsilon_start, dqn.epsilon_end, dqn.max_grad_norm) == (1.0, 0.05, 10.0)
         assert (config.eval_scenarios, config.eval_duration, config.num_seeds) == (128, 60.0, 1)
+        assert (config.eval_every, config.export) == (20_000, "last")
+        assert (config.validation_scenarios, config.validation_duration) == (6, 20.0)
         assert (config.seed, config.num_devices) == (0, None)
         assert (config.randomization.payload_offset, config.randomization.payload_height) == (
             0.05,
@@ -115,6 +117,11 @@ def test_preset_smoke_is_the_default_made_small() -> None:
     assert (smoke.task, smoke.randomization) == (default.task, default.randomization)
     assert (smoke.num_envs, smoke.num_env_steps, smoke.log_every) == (64, 8_192, 1_024)
     assert (smoke.eval_scenarios, smoke.eval_duration) == (16, 20.0)
+    assert (smoke.eval_every, smoke.validation_scenarios, smoke.validation_duration) == (
+        4_096,
+        2,
+        10.0,
+    )
     assert smoke.dqn.head == default.dqn.head
     assert smoke.dqn.epsilon_decay_steps < smoke.num_env_steps
     assert smoke.dqn.whiten_steps < smoke.num_env_steps
@@ -269,6 +276,9 @@ BOUNDS: list[tuple[str, str, tuple[Any, ...], tuple[Any, ...]]] = [
     ("run", "line_search_iterations", (1, 100), ABOVE_0),
     ("run", "eval_scenarios", (1, 4096), ABOVE_0),
     ("run", "eval_duration", (0.2, 600.0), (0.0, -60.0)),
+    ("run", "eval_every", (0, 1, 10**6), NOT_BELOW_0),
+    ("run", "validation_scenarios", (1, 64), ABOVE_0),
+    ("run", "validation_duration", (0.2, 60.0), (0.0, -20.0)),
 ]
 
 
@@ -319,6 +329,8 @@ def test_no_number_may_be_infinite(section: str, name: str, value: float) -> Non
     [
         ({"seed": 2**31 - 5, "num_seeds": 6}, ("seed is", "2**31")),
         ({"preset": "papr"}, ("papr", "paper, default, best, smoke")),
+        ({"export": "first"}, ("export is 'first'; it must be one of last, best",)),
+        ({"export": "best", "eval_every": 0}, ("export is 'best', but eval_every is 0",)),
     ],
 )
 def test_impossible_run_is_refused(values: dict[str, Any], words: tuple[str, ...]) -> None:

@@ -87,6 +87,47 @@ def test_plain_output_leaves_out_what_is_not_known(clock: Clock) -> None:
     assert out.getvalue().split("decisions")[1].split() == ["reward", "-0.500", "left", "0", "s"]
 
 
+VALIDATED = {
+    "eval/paper/tilt_mean": 0.0844,
+    "eval/paper/falls": 0.0,
+    "eval/corner/tilt_mean": 1.25,
+    "eval/corner/falls": 2.5,
+}
+HELD_OUT = ("held out, paper 0.084 deg, falls 0", "held out, corner 1.250 deg, falls 2.5")
+
+
+def test_a_validation_is_shown_until_the_next_one(clock: Clock) -> None:
+    """Behind the other numbers, and not before there is one; nothing else is shown for longer."""
+    display, out = screen(terminal=False)
+    with display.training(0, 400):
+        for done, metrics in (
+            (100, {"train/loss": 1.0}),
+            (200, {"train/reward": 1.0} | VALIDATED),
+            (300, {"train/epsilon": 0.5}),
+            (400, {"train/epsilon": 0.5} | VALIDATED | {"eval/paper/falls": 1.0}),
+        ):
+            clock.now += 10
+            display.update(done, metrics)
+    shown = [line.split("decisions  ")[1] for line in out.getvalue().splitlines()]
+    numbers = "  ".join(HELD_OUT)
+    assert shown == [
+        "loss 1.00000  left 30 s",
+        f"reward 1.000  {numbers}  left 20 s",
+        f"epsilon 0.500  {numbers}  left 10 s",
+        f"epsilon 0.500  {numbers.replace('falls 0', 'falls 1')}  left 0 s",
+    ]
+
+
+def test_a_terminal_shows_a_validation_in_a_row_of_its_own() -> None:
+    display, out = screen(terminal=True)
+    with display.training(200, 1_000):
+        display.update(600, METRICS | VALIDATED)
+        display.update(800, METRICS)
+    lines = [line.strip("│ ") for line in plain(out.getvalue())]
+    last = len(lines) - 1 - lines[::-1].index(next(x for x in lines if "mjx_balance" in x))
+    assert lines[last + 2 : last + 5] == [" ".join(x) for x in (CELLS[:3], CELLS[3:], HELD_OUT)]
+
+
 def test_a_phase_says_what_is_done_and_how_long_it_took(clock: Clock) -> None:
     display, out = screen(terminal=False)
     with display.phase("compiling"):

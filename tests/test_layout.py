@@ -36,6 +36,7 @@ FLOORS = (
     ("report.page",),
     ("training.checkpoints", "training.program_cache"),
     ("training.devices", "training.loop"),
+    ("training.validation",),
     ("training.finish",),
     ("training.run",),
     ("training",),

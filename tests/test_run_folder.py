@@ -21,6 +21,7 @@ from mjx_balance.run_folder import (
     check_same_provenance,
     create_run_folder,
     keep_metrics_until,
+    keep_validated_until,
     locked,
     read_run_config,
     write_atomically,
@@ -204,6 +205,20 @@ def test_metrics_are_kept_up_to_the_checkpoint(tmp_path: Path) -> None:
     log.write_bytes(text.encode(errors="surrogateescape"))
     keep_metrics_until(log, 2048)
     assert log.read_text() == '{"env_steps": 1024}\n{"env_steps": 2048}\n'
+
+
+def test_validated_policies_of_a_lost_history_are_dropped(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    keep_validated_until(folder.validated, 5)  # none yet
+    assert folder.validated_policy(3, 900) == tmp_path / "validated" / "900" / "seed-3.safetensors"
+    for env_steps in (900, 2_048, 2_049, 10_000):
+        file = folder.validated_policy(0, env_steps)
+        file.parent.mkdir(parents=True)
+        file.write_text("a policy")
+    (folder.validated / "notes").mkdir()
+    keep_validated_until(folder.validated, 2_048)
+    assert {path.name for path in folder.validated.iterdir()} == {"900", "2048", "notes"}
+    assert folder.validated_policy(0, 2_048).is_file()
 
 
 JSON = st.recursive(

@@ -12,6 +12,7 @@ import numpy as np
 from mjx_balance.config import TaskConfig
 from mjx_balance.evaluation import Envelope, Rollout
 from mjx_balance.scene import Scene
+from mjx_balance.suites import HEADLINE
 from mjx_balance.task.attitude import roll_pitch
 from mjx_balance.task.reward import reward_terms
 
@@ -96,11 +97,15 @@ CURVES = (
     ("perf/env_steps_per_second", "decisions per second", "linear"),
 )
 """Metric, title and scale of each panel of the learning curves."""
+HELD_OUT = {f"eval/{suite}/tilt_mean": f"held out, {suite}" for suite in HEADLINE}
+"""Metrics of the validations that are points beside the tilt in training, and their labels."""
 
 
 @styled
 def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
     """Tilt, falls, reward, loss, epsilon and speed over the decisions.
+
+    A point beside the tilt is one validation of one seed, where there were any.
 
     Args:
       runs: the lines of metrics.jsonl of each run. Where a line has values per seed, or
@@ -130,11 +135,28 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
         if name == "train/tilt_deg":
             axis.yaxis.set_major_formatter("{x:g}")
             axis.yaxis.set_minor_formatter("{x:g}")
+            axis.yaxis.set_minor_locator(mpl.ticker.LogLocator(subs=(2, 5)))
+            _draw_held_out(axis, runs)
         if scale in ("linear", "symlog") and name != "train/reward":
             axis.set_ylim(bottom=0)
     for axis in axes[-1]:
         axis.set_xlabel("thousand decisions")
     return figure
+
+
+def _draw_held_out(axis: plt.Axes, runs: list[list[dict[str, Any]]]) -> None:
+    """Draws the validations of every run and seed as points; none if there are none."""
+    for (name, label), colour in zip(HELD_OUT.items(), (ORANGE, GREY), strict=True):
+        points = [
+            (line["env_steps"] / 1000, value)
+            for run in runs
+            for line in run
+            for value in line.get("seeds", {}).get(name, [line.get(name)])
+            if value is not None and value > 0
+        ]
+        if points:
+            axis.plot(*zip(*points, strict=True), "o", ms=4, color=colour, label=label)
+            axis.legend()
 
 
 def _seed_curves(run: list[dict[str, Any]], name: str) -> np.ndarray:

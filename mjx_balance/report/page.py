@@ -253,7 +253,8 @@ def training_pictures(runs: Sequence[Run], config: Config | None) -> list[Pictur
     if curves:
         caption = (
             "Training. The line is the median over runs and seeds, the band their extremes; tilt, "
-            "falls and reward are those of the exploring policy."
+            "falls and reward are those of the exploring policy. Points, where there are any: the "
+            "greedy policy of a seed on held-out boards in plain MuJoCo."
         )
         drawn.append(_picture("Learning curves", figures.learning_curves(curves), caption))
     if config is not None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from mjx_balance.config import Config, check, from_dict
 from mjx_balance.policy import Policy, load_policy
-from mjx_balance.report.figures import CURVES
+from mjx_balance.report.figures import CURVES, HELD_OUT
 from mjx_balance.run_folder import RunFolder, parse_json, read_json
 from mjx_balance.statistics import TILTS
 
@@ -200,12 +200,13 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
         )
     found.setdefault("train/loss", math.nan)  # before the first update there is none
     line |= {name: _logged(found[name], name) for name, _, _ in CURVES}
+    line |= {name: _logged(found[name], name) for name in HELD_OUT if name in found}
     seeds = section(found.get("seeds", {}), "seeds")
     if seeds:
         short = [name.removeprefix("train/") for name, _, _ in CURVES]
         line["seeds"] = {
             name: [_logged(math.nan if x is None else x, name) for x in series(seeds[name], name)]
-            for name in short
+            for name in (*short, *HELD_OUT)
             if name in seeds
         }
     if 0 in _counts(line).values():
@@ -216,8 +217,9 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _counts(line: dict[str, Any]) -> dict[str, int]:
-    """Number of seeds that a line has of each metric."""
-    return {name: len(values) for name, values in line.get("seeds", {}).items()}
+    """Number of seeds that a line has of each metric that every line has."""
+    seeds = line.get("seeds", {})
+    return {name: len(values) for name, values in seeds.items() if name not in HELD_OUT}
 
 
 def _logged(value: Any, name: str) -> float:

@@ -1,31 +1,27 @@
 """The end of a run: a policy per seed, their evaluation, the best one, figures, a summary."""
 
-import dataclasses
 import json
+import shutil
 import time
-from typing import Any
 
-import jax
 from tensorboardX import SummaryWriter
 
 from mjx_balance import evaluation
 from mjx_balance.config import Config, ConfigError
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
-from mjx_balance.policy import Policy, PolicyError, load_policy, make_manifest, save_policy
+from mjx_balance.policy import Policy, PolicyError, load_policy, save_policy
 from mjx_balance.report import figures, measuring, tables
 from mjx_balance.run_folder import RunFolder, write_atomically, write_json
 from mjx_balance.statistics import over_seeds
 from mjx_balance.suites import HEADLINE, SEEDS
-from mjx_balance.training.loop import number
 from mjx_balance.training.program_cache import Say
+from mjx_balance.training.validation import Results, best_validated, exports, scalars, score
 
-VALIDATION_SCENARIOS = 32
-EVALUATION_EVENTS = ".evaluation"
-"""Ending of the TensorBoard file that has it."""
-
-Results = dict[str, dict[str, Any]]
-"""Suite name -> JSON of `evaluation.summarize`."""
+CHOICE_SCENARIOS = 32
+"""Scenarios per suite by which one of several seeds is chosen."""
+FINAL = "final"
+"""TensorBoard's name for the evaluation after training, which has the validations' tags."""
 
 
 def check_fits(config: Config) -> None:
@@ -34,10 +30,14 @@ def check_fits(config: Config) -> None:
     Raises:
       ConfigError: with the estimate.
     """
-    try:
-        evaluation.check_fits(config.task, config.eval_scenarios, config.eval_duration)
-    except evaluation.EvaluationError as error:
-        raise ConfigError(f"eval_{error}") from error
+    for kind, scenarios, duration in (
+        ("eval", config.eval_scenarios, config.eval_duration),
+        ("validation", config.validation_scenarios, config.validation_duration),
+    ):
+        try:
+            evaluation.check_fits(config.task, scenarios, duration)
+        except evaluation.EvaluationError as error:
+            raise ConfigError(f"{kind}_{error}") from error
 
 
 def export(
@@ -51,6 +51,9 @@ def export(
 ) -> list[Policy]:
     """Writes a policy per seed; the first also as the run's, until a better one is known.
 
+    A seed's policy is that of the state or, if `config.export` says so, the one that validated
+    best so far.
+
     Args:
       config: of the run.
       learner: exports the parameters.
@@ -63,27 +66,23 @@ def export(
     Raises:
       PolicyError: if no seed has a policy.
     """
-    known = state._replace(env_state=None, replay=None)  # pyright: ignore[reportArgumentType]
-    training = {
-        "env_steps": number(state.env_steps),
-        "gradient_steps": number(state.gradient_steps),
-        "seconds_learning_since_start_or_resume": round(seconds, 1),
-        "device": jax.devices()[0].device_kind,
-        "date": time.strftime("%Y-%m-%d"),
-    }
     policies, files = [], []
-    for k in range(config.num_seeds):
-        own = dataclasses.replace(config, seed=config.seed + k, num_seeds=1)
-        mine = jax.tree.map(lambda x: x[k], known) if config.num_seeds > 1 else known  # noqa: B023
-        weights = jax.device_get(learner.exported(mine))
-        manifest = make_manifest(own, scene_hash, training)
-        file = folder.policy if config.num_seeds == 1 else folder.seed_policy(own.seed)
+    for weights, manifest in exports(config, learner, scene_hash, state):
+        manifest["training"]["seconds_learning_since_start_or_resume"] = round(seconds, 1)
+        seed = manifest["config"]["seed"]
+        file = folder.policy if config.num_seeds == 1 else folder.seed_policy(seed)
+        best = best_validated(folder, seed, say) if config.export == "best" else None
+        file.parent.mkdir(exist_ok=True)
         try:
-            file.parent.mkdir(exist_ok=True)
-            policies.append(save_policy(file, weights, manifest))
+            if best is None:
+                policies.append(save_policy(file, weights, manifest))
+            else:
+                write_atomically(file, best.read_bytes())
+                policies.append(load_policy(file))
+                say(f"seed {seed}: of {best.parent.name} decisions, the best by validation")
             files.append(file)
         except PolicyError as error:
-            say(f"seed {own.seed} gives no policy: {error}")
+            say(f"seed {seed} gives no policy: {error}")
     if not policies:
         raise PolicyError(
             f"the run in {folder.path} learnt no policy of finite numbers; lower learning_rate"
@@ -138,13 +137,10 @@ def _evaluate(
 
 def _log(results: Results, env_steps: int, folder: RunFolder) -> None:
     """Gives TensorBoard the evaluation, once even if an earlier call was killed after that."""
-    for written in folder.tensorboard.glob(f"*{EVALUATION_EVENTS}"):
-        written.unlink()
-    with SummaryWriter(str(folder.tensorboard), filename_suffix=EVALUATION_EVENTS) as board:
-        for suite, result in results.items():
-            board.add_scalar(f"eval/{suite}/falls", result["falls"], env_steps)
-            for name, value in result["tilt_deg"].items():
-                board.add_scalar(f"eval/{suite}/tilt_{name}", value, env_steps)
+    shutil.rmtree(folder.tensorboard / FINAL, ignore_errors=True)
+    with SummaryWriter(str(folder.tensorboard / FINAL)) as board:
+        for name, value in scalars(results).items():
+            board.add_scalar(name, value, env_steps)
 
 
 def _choose(
@@ -156,10 +152,10 @@ def _choose(
 ) -> int:
     """Validates every seed, makes the best one the run's policy, writes seeds.json."""
     validated = [
-        _evaluate(policy, VALIDATION_SCENARIOS, duration, SEEDS.validation, True, display)
+        _evaluate(policy, CHOICE_SCENARIOS, duration, SEEDS.validation, True, display)
         for policy in policies
     ]
-    best = min(range(len(policies)), key=lambda k: _score(validated[k]))
+    best = min(range(len(policies)), key=lambda k: score(validated[k]))
     seeds = [policy.config.seed for policy in policies]
     write_atomically(folder.policy, folder.seed_policy(seeds[best]).read_bytes())
     summary = {suite: over_seeds([results[suite] for results in each]) for suite in HEADLINE}
@@ -171,9 +167,3 @@ def _choose(
     display.say(f"best of the {len(policies)} seeds on the validation set: {seeds[best]}")
     display.console.print(tables.seeds_table(summary))
     return best
-
-
-def _score(results: Results) -> tuple[int, float]:
-    """Falls and mean tilt over all suites: less is better, falls first."""
-    falls = sum(result["falls"] for result in results.values())
-    return falls, sum(result["tilt_deg"]["mean"] for result in results.values())

@@ -19,7 +19,7 @@ from tensorboardX import SummaryWriter
 from mjx_balance.config import Config
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import TrainState
-from mjx_balance.run_folder import RunFolder, keep_metrics_until
+from mjx_balance.run_folder import RunFolder, keep_metrics_until, keep_validated_until
 from mjx_balance.training import checkpoints
 
 T = TypeVar("T")
@@ -31,6 +31,8 @@ ANSWER_S = 0.2
 
 Program = Callable[[TrainState], tuple[TrainState, Mapping[str, jax.Array]]]
 """A compiled call: many decisions of every env, and the means of what was measured."""
+Validate = Callable[[TrainState], Mapping[str, np.ndarray]]
+"""Tries the greedy policies of a state; what came of it by logged names, one value per seed."""
 
 
 class Plan(NamedTuple):
@@ -46,6 +48,8 @@ class Plan(NamedTuple):
     """Length of a decision, s."""
     sim_steps: int
     """Physics steps per decision."""
+    eval_every: int
+    """Decisions of one seed's envs between two validations; 0: never."""
     checkpoint_seconds: float
     """Time between two checkpoints, s."""
 
@@ -67,6 +71,7 @@ def make_plan(config: Config) -> Plan:
         total=-(-config.num_env_steps // per_call) * per_call,
         decision_s=config.task.ctrl_dt,
         sim_steps=config.task.sim_steps,
+        eval_every=config.eval_every,
         checkpoint_seconds=config.checkpoint_seconds,
     )
 
@@ -152,18 +157,21 @@ def learn(
     folder: RunFolder,
     display: Display,
     stop: Interrupts,
+    validate: Validate,
 ) -> tuple[TrainState, float]:
     """Calls the program until the last decision or until the user stops; saves either way.
 
-    Every call is logged. What the folder has logged after the state's decisions is dropped
-    first: a resumed run logs it again.
+    Every call is logged, with the validation that is due after it: it is made before its line
+    and before a checkpoint, so that a run that is resumed has neither missed it nor logs it
+    twice. What the folder has logged or validated after the state's decisions is dropped first.
 
     Returns:
-      The last state, and the seconds spent learning by this call.
+      The last state, and the seconds spent learning by this call, validations apart.
     """
     done = number(state.env_steps)
     keep_metrics_until(folder.metrics, done)
-    seconds = 0.0
+    keep_validated_until(folder.validated, done)
+    seconds = validating = 0.0
     saved_at = time.monotonic()
     with (
         folder.metrics.open("a") as log,
@@ -171,14 +179,24 @@ def learn(
         display.training(done, plan.total),
     ):
         while done < plan.total and not stop:
-            began = time.perf_counter()
+            before, began = done, time.perf_counter()
             state, raw = stop.run(_finished, program, state)
             elapsed = time.perf_counter() - began
             seconds += elapsed
             done = number(state.env_steps)
             metrics, seeds = measured(raw, elapsed, plan)
-            line = {"env_steps": done, "gradient_steps": number(state.gradient_steps)}
-            log.write(json.dumps(line | metrics | seeds) + "\n")
+            if validation_due(plan, before, done):
+                began = time.perf_counter()
+                held_out = stop.run(validate, state)
+                validating += time.perf_counter() - began
+                metrics |= means(held_out)
+                metrics["perf/validation_share"] = validating / (seconds + validating)
+                seeds |= listed(held_out)
+            line: dict[str, Any] = {"env_steps": done}
+            line |= {"gradient_steps": number(state.gradient_steps)} | metrics
+            if plan.num_seeds > 1:
+                line["seeds"] = seeds
+            log.write(json.dumps(line) + "\n")
             log.flush()
             for name, value in metrics.items():
                 board.add_scalar(name, value, done)
@@ -188,6 +206,13 @@ def learn(
                 saved_at = time.monotonic()
     checkpoints.save(folder.checkpoints, done, state)
     return state, seconds
+
+
+def validation_due(plan: Plan, before: int, done: int) -> bool:
+    """Whether a call from `before` to `done` decisions passes a validation, or ends the run."""
+    if not plan.eval_every:
+        return False
+    return done // plan.eval_every > before // plan.eval_every or done >= plan.total
 
 
 def _board(folder: RunFolder, done: int) -> SummaryWriter:
@@ -209,7 +234,7 @@ def number(count: jax.Array) -> int:
 
 def measured(
     raw: Mapping[str, np.ndarray], seconds: float, plan: Plan
-) -> tuple[dict[str, float], dict[str, Any]]:
+) -> tuple[dict[str, float], dict[str, list[float | None]]]:
     """What a call measured, under the names it is logged by.
 
     Args:
@@ -219,23 +244,29 @@ def measured(
       plan: of the run.
 
     Returns:
-      Means over the seeds that have a value, without those that none has, and, if there are
-      several seeds, `{"seeds": {name: values}}` with None for a seed without a value.
+      The `means`, and what is `listed` of `PER_SEED`.
     """
     values = {name: np.atleast_1d(np.asarray(value, float)) for name, value in raw.items()}
     values["falls_per_minute"] = values.pop("fall") * 60 / plan.decision_s
     if "diverged" in values:  # envs, not a share of the decisions
         values["diverged"] *= plan.per_call
-    known = {name: value[np.isfinite(value)] for name, value in values.items()}
-    metrics = {f"train/{name}": float(value.mean()) for name, value in known.items() if value.size}
+    metrics = {f"train/{name}": value for name, value in means(values).items()}
     rate = plan.num_seeds * plan.per_call / seconds
     metrics["perf/env_steps_per_second"] = rate
     metrics["perf/physics_steps_per_second"] = rate * plan.sim_steps
-    if plan.num_seeds == 1:
-        return metrics, {}
-    per_seed = {
-        name: [x if math.isfinite(x) else None for x in values[name].tolist()]
-        for name in PER_SEED
-        if known[name].size
+    return metrics, listed({name: values[name] for name in PER_SEED})
+
+
+def means(values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Means over the seeds that have a value, without those that none has."""
+    known = {name: value[np.isfinite(value)] for name, value in values.items()}
+    return {name: float(value.mean()) for name, value in known.items() if value.size}
+
+
+def listed(values: Mapping[str, np.ndarray]) -> dict[str, list[float | None]]:
+    """The values of every seed, None for one without, less those that no seed has."""
+    return {
+        name: [x if math.isfinite(x) else None for x in value.tolist()]
+        for name, value in values.items()
+        if np.isfinite(value).any()
     }
-    return metrics, {"seeds": per_seed}

@@ -30,6 +30,7 @@ LIBRARIES = ("mjx_balance", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "fl
 """What a run's bits depend on besides this package's code."""
 NOT_TRACED = (
     *("preset", "seed", "log_every", "checkpoint_seconds"),
+    *("eval_every", "validation_scenarios", "validation_duration", "export"),
     *("eval_scenarios", "eval_duration"),
 )
 """Fields of the config that the program is the same for; any other may change it."""

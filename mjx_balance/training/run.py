@@ -1,6 +1,7 @@
 """A run from its config to its last table."""
 
 import contextlib
+import functools
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,7 +21,7 @@ from mjx_balance.run_folder import (
     locked,
     read_run_config,
 )
-from mjx_balance.training import checkpoints, devices, finish, loop, program_cache
+from mjx_balance.training import checkpoints, devices, finish, loop, program_cache, validation
 from mjx_balance.training.program_cache import Say
 
 
@@ -60,7 +61,8 @@ def train(
     folder = _open_folder(config, provenance(env), run_dir, resume, display.say)
     with locked(folder), _resumable(folder):
         with loop.Interrupts(display.say) as stop:
-            state, seconds = _learn(config, learner, folder, display, stop)
+            validate = functools.partial(validation.validate, config, learner, env.scene, folder)
+            state, seconds = _learn(config, learner, folder, display, stop, validate)
             policies = finish.export(
                 config, learner, env.scene.hash, folder, state, seconds, display.say
             )
@@ -113,6 +115,7 @@ def _learn(
     folder: RunFolder,
     display: Display,
     stop: loop.Interrupts,
+    validate: loop.Validate,
 ) -> tuple[TrainState, float]:
     """Goes on from the newest checkpoint, if there is one, to the last decision.
 
@@ -131,7 +134,7 @@ def _learn(
         if loop.number(state.env_steps) < plan.total:
             key = program_cache.program_key(config, plan.iterations, devices.__name__)
             program = stop.run(program_cache.compile_program, program, state, key, display.say)
-    return loop.learn(plan, program, state, folder, display, stop)
+    return loop.learn(plan, program, state, folder, display, stop, validate)
 
 
 @contextlib.contextmanager

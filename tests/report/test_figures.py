@@ -105,6 +105,31 @@ def test_a_run_whose_first_lines_have_no_loss_yet_is_drawn() -> None:
     np.testing.assert_allclose(data(figure.axes[3]), [(1, 1), (2, 4)])
 
 
+def test_learning_curves_show_validations_as_points_beside_the_tilt() -> None:
+    """Of a run of one seed, and of one of two, of which one has diverged at last."""
+    paper, corner = "eval/paper/tilt_mean", "eval/corner/tilt_mean"
+    one = [metrics_line(1_000 * k, [1.0] * 6) for k in (1, 2, 3)]
+    one[1] |= {paper: 0.5, corner: 0.75}
+    one[2] |= {paper: 0.25, corner: np.nan}
+    two = [metrics_line(1_000 * k, [1.0] * 6, tilt_deg=[1.0, 1.0]) for k in (1, 4)]
+    two[0] |= {paper: 3.0}
+    two[0]["seeds"] |= {paper: [2.0, 4.0]}
+    two[1] |= {paper: 0.125}
+    two[1]["seeds"] |= {paper: [0.125, None]}
+    axes = figures.learning_curves([one, two]).axes
+    np.testing.assert_allclose(
+        data(axes[0], 1), [(2, 0.5), (3, 0.25), (1, 2.0), (1, 4.0), (4, 0.125)]
+    )
+    np.testing.assert_allclose(data(axes[0], 2), [(2, 0.75)])
+    assert [line.get_linestyle() for line in axes[0].get_lines()] == ["-", "None", "None"]
+    legend = axes[0].get_legend()
+    assert legend is not None
+    assert [x.get_text() for x in legend.get_texts()] == ["held out, paper", "held out, corner"]
+    assert [len(axis.get_lines()) for axis in axes] == [3, 1, 1, 1, 1, 1]
+    bare = figures.learning_curves([[metrics_line(1_000, [1.0] * 6)]]).axes[0]
+    assert bare.get_legend() is None
+
+
 def test_reward_figure_is_equation_4_and_our_figure_5(config: Config) -> None:
     task = dataclasses.replace(config.task, reward_toward=0.8, reward_toward_scale=1.6)
     left, right = figures.reward_figure(task).axes

@@ -138,6 +138,8 @@ def test_results_are_numbers(tmp_path: Path, where: str, value: Any, said: str) 
         ("seeds", {"loss": 1.0}),
         ("seeds", {"loss": [1.0, HOSTILE]}),
         ("seeds", {"loss": []}),
+        ("eval/paper/tilt_mean", HOSTILE),
+        ("seeds", {"eval/paper/tilt_mean": [HOSTILE]}),
     ],
 )
 def test_metrics_are_numbers(tmp_path: Path, where: str, value: Any) -> None:
@@ -154,6 +156,20 @@ def test_seeds_that_change_along_the_way_are_refused(tmp_path: Path) -> None:
     run = reading.read_run(tmp_path)
     assert len(run.metrics) == 1
     assert "other seeds than in line 1" in "".join(run.missing)
+
+
+def test_validations_are_read_where_there_are_any(tmp_path: Path) -> None:
+    name = "eval/corner/tilt_mean"
+    lines = [metrics_line(k, 2) for k in range(3)]
+    lines[1] |= {name: 0.5, "eval/corner/falls": 1}
+    lines[1]["seeds"] = lines[1]["seeds"] | {name: [0.5, None]}
+    lines[2] |= {name: 0.25}
+    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    run = reading.read_run(tmp_path)
+    assert [line.get(name) for line in run.metrics] == [None, 0.5, 0.25]
+    np.testing.assert_array_equal(run.metrics[1]["seeds"][name], [0.5, np.nan])
+    assert name not in run.metrics[2]["seeds"]
+    assert "eval/corner/falls" not in run.metrics[1]
 
 
 def test_a_loss_that_is_no_number_is_a_gap(tmp_path: Path) -> None:

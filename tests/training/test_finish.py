@@ -4,60 +4,21 @@ import dataclasses
 import io
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
+from stub_learner import CONFIG, PARAMS, SEED, Learner, state_of
 from tensorboardX.proto.event_pb2 import Event
 
 from mjx_balance import load_policy
-from mjx_balance.config import ConfigError, preset
+from mjx_balance.config import ConfigError
 from mjx_balance.display import Display
-from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.policy import Policy, PolicyError
-from mjx_balance.robots import find_robot
 from mjx_balance.run_folder import RunFolder
 from mjx_balance.suites import SEEDS
-from mjx_balance.task.observation import observation_names
 from mjx_balance.training import finish
-
-CONFIG = preset("smoke")
-SEED = CONFIG.seed
-
-
-class State(NamedTuple):
-    params: Any
-    env_steps: Any
-    gradient_steps: Any
-    env_state: Any
-    replay: Any
-
-
-class Learner:
-    """Exports parameters as they are."""
-
-    network = QNetwork(CONFIG.dqn.hidden_sizes, (21, 21), radial=True)
-
-    @staticmethod
-    def exported(state: State) -> Any:
-        assert state.env_state is None  # may be gigabytes
-        assert state.replay is None
-        return state.params
-
-
-OBS = len(observation_names(CONFIG.task, find_robot(CONFIG.robot)))
-PARAMS = Learner.network.init(jax.random.PRNGKey(0), jnp.zeros(OBS))
-
-
-def state_of(*scales: float) -> State:
-    """Of as many seeds, parameters times a scale: not a number, for a seed that diverged."""
-    count = jnp.full(len(scales), 64)
-    params = jax.tree.map(lambda x: jnp.stack([x * scale for scale in scales]), PARAMS)
-    state = State(params, count, 3 * count, count, count)
-    return state if len(scales) > 1 else jax.tree.map(lambda x: x[0], state)
 
 
 @pytest.fixture
@@ -68,9 +29,9 @@ def folder(tmp_path: Path) -> RunFolder:
 def export(folder: RunFolder, *scales: float) -> tuple[list[Policy], list[str]]:
     config = dataclasses.replace(CONFIG, num_seeds=len(scales))
     said: list[str] = []
-    state: Any = state_of(*scales)
     learner: Any = Learner()
-    return finish.export(config, learner, "hash", folder, state, 1.26, said.append), said
+    policies = finish.export(config, learner, "hash", folder, state_of(*scales), 1.26, said.append)
+    return policies, said
 
 
 def first_weight(policy: Policy) -> float:
@@ -126,6 +87,10 @@ def test_an_evaluation_beyond_the_memory_is_refused_by_its_field() -> None:
         finish.check_fits(dataclasses.replace(CONFIG, eval_scenarios=100_000_000))
     with pytest.raises(ConfigError, match="GiB are free"):
         finish.check_fits(dataclasses.replace(CONFIG, eval_duration=1e12))
+    with pytest.raises(ConfigError, match="validation_scenarios is 100000000 and duration 10 s:"):
+        finish.check_fits(dataclasses.replace(CONFIG, validation_scenarios=100_000_000))
+    with pytest.raises(ConfigError, match="validation_scenarios is 2 and duration 1e"):
+        finish.check_fits(dataclasses.replace(CONFIG, validation_duration=1e12))
 
 
 def result(suite: str, falls: int, mean: float, seed: int) -> dict[str, Any]:
@@ -203,7 +168,7 @@ def test_the_best_seed_is_chosen_by_the_validation_alone(
     asked = {call[2:] for call in calls if len(call) == 5}
     assert asked == {
         (4, 5.0, SEEDS.final),
-        (finish.VALIDATION_SCENARIOS, 5.0, SEEDS.validation),
+        (finish.CHOICE_SCENARIOS, 5.0, SEEDS.validation),
     }
     assert SEEDS.final != SEEDS.validation
 
@@ -236,11 +201,11 @@ def test_a_run_killed_while_it_finishes_finishes_again(
             finished(folder, 1.0)
     assert not folder.evaluation.exists()
     # TensorBoard's names count seconds: two runs within one would hide a file that is left.
-    for number, file in enumerate(list(folder.tensorboard.glob("*.evaluation"))):
-        file.rename(file.with_name(f"events.out.tfevents.{number}.earlier.evaluation"))
+    for number, file in enumerate(list((folder.tensorboard / "final").iterdir())):
+        file.rename(file.with_name(f"events.out.tfevents.{number}.earlier"))
     finished(folder, 1.0)
     tags: list[str] = []
-    for file in folder.tensorboard.iterdir():
+    for file in (folder.tensorboard / "final").iterdir():
         content = file.read_bytes()
         while content:
             length = int.from_bytes(content[:8], "little")

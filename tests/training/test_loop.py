@@ -11,7 +11,7 @@ import struct
 import threading
 import time
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,6 +37,7 @@ PLAN = Plan(
     total=100,
     decision_s=0.2,
     sim_steps=50,
+    eval_every=0,
     checkpoint_seconds=1e9,
 )
 RAW = {"fall": 0.02, "tilt_deg": 0.5, "reward": 0.3, "loss": 0.25, "epsilon": 0.1}
@@ -77,16 +78,22 @@ def stop() -> Iterator[Interrupts]:
         yield interrupts
 
 
+def never(state: Any) -> dict[str, np.ndarray]:
+    pytest.fail("nothing is to be validated here")
+
+
 def run(
     folder: RunFolder,
     display: Display,
     stop: Interrupts,
     program: Callable[[Any], Any] = step,
     plan: Plan = PLAN,
+    validate: loop.Validate = never,
 ) -> Any:
     """Goes on from the folder's newest checkpoint, as a run does."""
     saved = checkpoints.restore(folder.checkpoints, start(), pytest.fail)
-    return learn(plan, program, saved or start(), folder, display, stop)[0]  # pyright: ignore
+    state: Any = saved or start()
+    return learn(plan, program, state, folder, display, stop, validate)[0]
 
 
 def logged(folder: RunFolder) -> list[dict[str, Any]]:
@@ -94,11 +101,12 @@ def logged(folder: RunFolder) -> list[dict[str, Any]]:
 
 
 def test_a_plan_rounds_the_run_up_to_whole_calls() -> None:
-    config = Config(num_envs=64, num_env_steps=1_000, log_every=300, num_seeds=3)
+    config = Config(num_envs=64, num_env_steps=1_000, log_every=300, num_seeds=3, eval_every=500)
     plan = make_plan(config)
     assert (plan.iterations, plan.per_call, plan.total) == (4, 256, 1024)
     assert (plan.num_envs, plan.num_seeds) == (64, 3)
     assert (plan.decision_s, plan.sim_steps, plan.checkpoint_seconds) == (0.2, 50, 45)
+    assert plan.eval_every == 500
     rare = make_plan(Config(num_envs=64, num_env_steps=1_024, log_every=1))
     assert (rare.iterations, rare.total) == (1, 1024)  # at least one decision a call
     other = make_plan(Config(num_envs=8, task=TaskConfig(ctrl_dt=0.1, sim_dt=0.002)))
@@ -114,7 +122,7 @@ def test_every_call_is_logged_and_the_end_is_saved(
         return step(state)
 
     zero: Any = start()
-    state, seconds = learn(PLAN, program, zero, folder, display, stop)
+    state, seconds = learn(PLAN, program, zero, folder, display, stop, never)
     assert float(state.weights) == 31  # ((((0*2+1)*2+1)*2+1)*2+1)*2+1
     assert [line["env_steps"] for line in logged(folder)] == [20, 40, 60, 80, 100]
     assert [line["gradient_steps"] for line in logged(folder)] == [3, 6, 9, 12, 15]
@@ -129,6 +137,7 @@ def test_every_call_is_logged_and_the_end_is_saved(
     }
     last = {name: value for name, value in logged(folder)[-1].items() if "/" in name}
     assert len(last) == 7
+    assert "seeds" not in logged(folder)[-1], "there is one"
     assert drawn == pytest.approx(last, rel=1e-6)
 
 
@@ -137,8 +146,7 @@ def test_checkpoints_are_at_most_a_minute_old() -> None:
 
 
 def test_names_and_units_of_what_is_logged() -> None:
-    metrics, seeds = measured({k: np.asarray(v, np.float32) for k, v in RAW.items()}, 0.5, PLAN)
-    assert seeds == {}
+    metrics, _ = measured({k: np.asarray(v, np.float32) for k, v in RAW.items()}, 0.5, PLAN)
     assert metrics == pytest.approx(
         {
             # 0.02 falls per decision of 0.2 s are 0.1 per second.
@@ -160,8 +168,8 @@ def test_several_seeds_are_averaged_and_listed() -> None:
     metrics, seeds = measured(raw, 0.5, PLAN._replace(num_seeds=2))
     assert metrics["train/tilt_deg"] == pytest.approx(1.0)
     assert metrics["perf/env_steps_per_second"] == pytest.approx(80)
-    assert set(seeds["seeds"]) == {"tilt_deg", "falls_per_minute", "reward", "loss"}
-    assert seeds["seeds"]["falls_per_minute"] == pytest.approx([6.0, 18.0], rel=1e-6)
+    assert set(seeds) == {"tilt_deg", "falls_per_minute", "reward", "loss"}
+    assert seeds["falls_per_minute"] == pytest.approx([6.0, 18.0], rel=1e-6)
 
 
 def test_what_was_not_measured_is_left_out() -> None:
@@ -174,9 +182,9 @@ def test_what_was_not_measured_is_left_out() -> None:
     raw["reward"] = np.asarray([np.nan, np.inf])
     metrics, seeds = measured(raw, 0.5, PLAN._replace(num_seeds=2))
     assert metrics["train/loss"] == 4
-    assert seeds["seeds"]["loss"] == [None, 4.0]
+    assert seeds["loss"] == [None, 4.0]
     assert "train/reward" not in metrics
-    assert "reward" not in seeds["seeds"]
+    assert "reward" not in seeds
     json.dumps([metrics, seeds], allow_nan=False)
 
 
@@ -221,7 +229,8 @@ def test_checkpoints_come_by_the_clock(
 
     zero: Any = start()
     plan = PLAN._replace(checkpoint_seconds=every)
-    assert learn(plan, second, zero, folder, display, stop)[1] == pytest.approx(50)
+    learnt = learn(plan, second, zero, folder, display, stop, never)
+    assert learnt[1] == pytest.approx(50)
     assert logged(folder)[3]["perf/env_steps_per_second"] == pytest.approx(2)
     assert checkpoints.saved_steps(folder.checkpoints) == steps
     if every == 2.0:
@@ -383,11 +392,205 @@ def test_seeds_count_their_decisions_together(
     plan = PLAN._replace(num_seeds=2)
     two: Any = start(2)
     state: Any
-    state, _ = learn(plan, lambda state: step(state, raw), two, folder, display, stop)
+    state, _ = learn(plan, lambda state: step(state, raw), two, folder, display, stop, never)
     np.testing.assert_array_equal(jax.device_get(state.weights), (31, 31))
     lines = logged(folder)
     assert [line["env_steps"] for line in lines] == [20, 40, 60, 80, 100]
     assert lines[0]["seeds"]["loss"] == [0.25, 0.25]
+
+
+def validating(folder: RunFolder, die: str = "", at: int = 0) -> loop.Validate:
+    """Validates the stub's weights: keeps them in a file, and finds a tilt of 1 / weights.
+
+    Args:
+      folder: of the run.
+      die: where it dies, "before" or "after" the file is written.
+      at: after so many decisions.
+    """
+
+    def validate(state: Any) -> dict[str, np.ndarray]:
+        done = int(state.env_steps)
+        if (die, at) == ("before", done):
+            raise Killed
+        file = folder.validated_policy(0, done)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"{state.weights}")
+        if (die, at) == ("after", done):
+            raise Killed
+        return {"eval/paper/tilt_mean": 1 / np.atleast_1d(state.weights)}
+
+    return validate
+
+
+def kept(folder: RunFolder) -> dict[int, str]:
+    """What was kept of the validations, by decisions."""
+    return {int(file.parent.name): file.read_text() for file in folder.validated.glob("*/*")}
+
+
+def held_out(folder: RunFolder) -> dict[int, float]:
+    return {
+        line["env_steps"]: line["eval/paper/tilt_mean"]
+        for line in logged(folder)
+        if "eval/paper/tilt_mean" in line
+    }
+
+
+@pytest.mark.parametrize(
+    ("every", "steps"),
+    [(0, []), (1, [20, 40, 60, 80, 100]), (50, [60, 100]), (45, [60, 100]), (70, [80, 100])],
+)
+def test_validations_come_by_the_decisions_and_at_the_end(
+    every: int, steps: list[int], folder: RunFolder, display: Display, stop: Interrupts
+) -> None:
+    """A call is 20 decisions: after the first that reaches 50 there are 60. The end is one more."""
+    plan = PLAN._replace(eval_every=every)
+    state = run(folder, display, stop, plan=plan, validate=validating(folder))
+    assert float(state.weights) == 31
+    assert [line["env_steps"] for line in logged(folder)] == [20, 40, 60, 80, 100]
+    weights = {20: 1, 40: 3, 60: 7, 80: 15, 100: 31}
+    assert held_out(folder) == {n: pytest.approx(1 / weights[n]) for n in steps}
+    drawn = {
+        event.step: value.simple_value
+        for event in events(folder)
+        for value in event.summary.value
+        if value.tag == "eval/paper/tilt_mean"
+    }
+    assert drawn == pytest.approx(held_out(folder), rel=1e-6)
+
+
+def test_validations_take_no_time_from_the_decisions(
+    folder: RunFolder, display: Display, stop: Interrupts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A call takes 2 s and a validation half a second: 10 decisions/s, and shares of the time."""
+    now = [0.0]
+    clock = types.SimpleNamespace(monotonic=lambda: now[0], perf_counter=lambda: now[0])
+    monkeypatch.setattr(loop, "time", clock)
+
+    def program(state: Any) -> Any:
+        now[0] += 2
+        return step(state)
+
+    def validate(state: Any) -> dict[str, np.ndarray]:
+        now[0] += 0.5
+        return {"eval/paper/falls": np.asarray([3.0])}
+
+    zero: Any = start()
+    plan = PLAN._replace(eval_every=40)
+    assert learn(plan, program, zero, folder, display, stop, validate)[1] == pytest.approx(10)
+    lines = logged(folder)
+    assert [line["perf/env_steps_per_second"] for line in lines] == pytest.approx([10] * 5)
+    shares = {x["env_steps"]: x.get("perf/validation_share") for x in lines}
+    assert shares.pop(20) is shares.pop(60) is None
+    # 0.5 of 4.5 s, 1 of 9 s, 1.5 of 11.5 s
+    assert shares == pytest.approx({40: 1 / 9, 80: 1 / 9, 100: 3 / 23})
+    assert lines[1]["eval/paper/falls"] == 3
+
+
+def test_validations_of_several_seeds_are_averaged_and_listed(
+    folder: RunFolder, display: Display, stop: Interrupts
+) -> None:
+    """A seed that has diverged has no value; the others have."""
+    raw = {k: [v, v, v] for k, v in RAW.items()}
+    plan = PLAN._replace(num_seeds=3, eval_every=100)
+    three: Any = start(3)
+    found = {"eval/corner/falls": np.asarray([4, np.nan, 1]), "eval/x": np.full(3, np.nan)}
+    learn(plan, lambda s: step(s, raw), three, folder, display, stop, lambda state: found)
+    lines = logged(folder)
+    assert lines[-1]["eval/corner/falls"] == 2.5
+    assert lines[-1]["seeds"]["eval/corner/falls"] == [4, None, 1]
+    assert "eval/x" not in lines[-1]
+    assert "eval/x" not in lines[-1]["seeds"]
+    assert "eval/corner/falls" not in lines[0]["seeds"]
+    assert lines[-1]["seeds"]["loss"] == [0.25, 0.25, 0.25]
+
+
+@pytest.mark.parametrize("every", [1e9, 1e-9])
+@pytest.mark.parametrize(
+    ("calls", "die", "at"),
+    [(9, "before", 60), (9, "after", 60), (3, "", 0), (4, "", 0), (9, "after", 100)],
+)
+def test_a_run_killed_about_a_validation_validates_as_an_undisturbed_one(
+    calls: int,
+    die: str,
+    at: int,
+    every: float,
+    folder: RunFolder,
+    display: Display,
+    stop: Interrupts,
+) -> None:
+    """In it, before or after it keeps its policy, or in a later call, with and without checkpoint.
+
+    What it kept of a history that is lost is gone, whatever the decisions it belonged to.
+    """
+    plan = PLAN._replace(checkpoint_seconds=every, eval_every=30)
+    with pytest.raises(Killed):
+        run(folder, display, stop, killed_after(calls), plan, validating(folder, die, at))
+    stray = folder.validated_policy(0, 110)
+    stray.parent.mkdir(parents=True, exist_ok=True)
+    stray.write_text("of another history")
+    seen: list[dict[int, str]] = []
+
+    def watched(state: Any) -> Any:
+        seen.append(kept(folder))
+        return step(state)
+
+    state = run(folder, display, stop, watched, plan, validating(folder))
+    assert float(state.weights) == 31
+    assert kept(folder) == {40: "3.0", 60: "7.0", 100: "31.0"}
+    assert held_out(folder) == pytest.approx({40: 1 / 3, 60: 1 / 7, 100: 1 / 31})
+    assert [line["env_steps"] for line in logged(folder)] == [20, 40, 60, 80, 100]
+    saved = (min(calls, at // 20 - 1 if at else 9) * 20) if every < 1 else 0
+    assert sorted(seen[0]) == [n for n in (40, 60, 100) if n <= saved]
+
+
+def test_an_interrupt_during_a_validation_is_answered_and_the_line_is_whole(
+    folder: RunFolder,
+) -> None:
+    answered = threading.Event()
+    display = Display(Console(file=io.StringIO(), width=200))
+    said: list[str] = []
+
+    def say(line: str) -> None:
+        said.append(line)
+        answered.set()
+
+    def validate(state: Any) -> Mapping[str, np.ndarray]:
+        if int(state.env_steps) == 40:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert answered.wait(10)
+        return validating(folder)(state)
+
+    plan = PLAN._replace(eval_every=40)
+    with Interrupts(say) as stop:
+        run(folder, display, stop, step, plan, validate)
+    assert len(said) == 1
+    assert said[0].startswith("stopping after this call and saving")
+    assert held_out(folder) == {40: pytest.approx(1 / 3)}
+    assert checkpoints.saved_steps(folder.checkpoints) == [40]
+    run(folder, display, Interrupts(say), step, plan, validating(folder))
+    assert list(held_out(folder)) == [40, 80, 100]
+
+
+def test_a_second_interrupt_does_not_wait_for_the_validation(
+    folder: RunFolder, display: Display, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it would have said is not logged, nor is its call saved: both come again."""
+    monkeypatch.setattr(loop.atexit, "register", lambda *call: None)
+    goes_on = threading.Event()
+
+    def validate(state: Any) -> dict[str, np.ndarray]:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.3)
+        os.kill(os.getpid(), signal.SIGINT)
+        goes_on.wait(20)
+        return {}
+
+    plan = PLAN._replace(eval_every=40)
+    with Interrupts(lambda said: None) as stop, pytest.raises(KeyboardInterrupt):
+        run(folder, display, stop, step, plan, validate)
+    goes_on.set()
+    assert [line["env_steps"] for line in logged(folder)] == [20]
+    assert checkpoints.saved_steps(folder.checkpoints) == []
 
 
 class Learner:
@@ -430,7 +633,7 @@ def test_a_run_begins_at_its_newest_checkpoint(
     learner: Any = Learner()
 
     def go_on() -> Any:
-        return run_module._learn(sized, learner, folder, display, stop)[0]
+        return run_module._learn(sized, learner, folder, display, stop, lambda state: {})[0]
 
     third = State(jnp.int32(3_072), jnp.int32(9), jnp.float32(100))
     checkpoints.save(folder.checkpoints, 1_024, start())

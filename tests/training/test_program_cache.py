@@ -163,6 +163,8 @@ def test_the_same_run_has_the_same_key_and_another_seed_too() -> None:
     assert key() == key()
     others = {"seed": 5, "preset": "best", "log_every": 7, "checkpoint_seconds": 1.0}
     others |= {"eval_scenarios": 3, "eval_duration": 1.0}
+    others |= {"eval_every": 0, "validation_scenarios": 3, "validation_duration": 1.0}
+    others |= {"export": "best"}
     assert set(others) == set(NOT_TRACED)
     assert key(dataclasses.replace(CONFIG, **others)) == key()
 

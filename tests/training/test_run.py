@@ -120,6 +120,25 @@ def test_metrics_are_logged_and_the_loss_falls(run: RunFolder) -> None:
     assert logged[-1]["train/epsilon"] < logged[0]["train/epsilon"]
 
 
+def held_out(folder: RunFolder) -> list[tuple[float, ...]]:
+    """Decisions and results of every validation that is logged."""
+    names = [f"eval/{s}/{n}" for s in ("paper", "corner") for n in ("falls", "tilt_mean")]
+    return [(x["env_steps"], *(x[n] for n in names)) for x in lines(folder) if names[0] in x]
+
+
+def validated(folder: RunFolder) -> dict[str, str]:
+    """Fingerprints of the validated policies that are kept."""
+    found = sorted(folder.validated.rglob("*.safetensors"))
+    return {str(x.relative_to(folder.path)): load_policy(x).fingerprint for x in found}
+
+
+def test_greedy_policies_are_validated_on_the_way(run: RunFolder) -> None:
+    assert [steps for steps, *_ in held_out(run)] == [4096, 6144]
+    kept = validated(run)
+    assert list(kept) == [f"validated/{n}/seed-0.safetensors" for n in (4096, 6144)]
+    assert kept["validated/6144/seed-0.safetensors"] == load_policy(run.policy).fingerprint
+
+
 def files(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
@@ -162,6 +181,8 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
     assert "resuming at 6,144 decisions" in done.said
     assert load_policy(folder.policy).fingerprint == load_policy(run.policy).fingerprint
     assert [x["env_steps"] for x in lines(folder)] == list(range(1024, 6145, 1024))
+    assert held_out(folder) == held_out(run)
+    assert validated(folder) == validated(run)
     evaluations = [json.loads(x.evaluation.read_text()) for x in (run, folder)]
     for results in evaluations:
         for result in results.values():
