@@ -1,17 +1,18 @@
 """How fast is the simulation, and what does learning cost on top?
 
 Measures, on whatever device JAX finds and interleaved in the same run:
-  mjx env    the raw environment in MJX, random actions, robots on their feet;
+  env        the raw environment over an engine, random actions, robots on their feet;
   training   the whole training program of a preset, its own number of updates;
-  mujoco     `mujoco.batch.Batch`, MuJoCo's C engine on all cores, same model and
+  Batch      `mujoco.batch.Batch`, MuJoCo's C engine on all cores, same model and
              actions of the same kind: the peer that the ratios are against.
 Each row runs in a process of its own. Compile time and peak memory stand apart.
 
-    python benchmarks/throughput.py [--num-envs 64 256 1024] [--preset default] [--json FILE]
+    python benchmarks/throughput.py [--engines mjx mujoco] [--num-envs 64 256 1024]
 """
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import platform
@@ -24,10 +25,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from markers import publish, table
+
 DECISIONS_PER_CALL = 2048
 
 
-def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
+def measure(engine: Any, num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
     """Measures one row in this process."""
     from mjx_balance.quiet import quiet_imports
 
@@ -38,7 +41,7 @@ def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
         from mjx_balance.training import devices
     from mjx_balance.config import preset
 
-    config = dataclasses.replace(preset(preset_name), num_envs=num_envs)
+    config = dataclasses.replace(preset(preset_name), engine=engine, num_envs=num_envs)
     devices.configure_jax(print)
     jax.config.update("jax_enable_compilation_cache", False)  # to time the compilation
     config = devices.size_to_device(config)
@@ -56,18 +59,19 @@ def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
         state, _ = train(state)
     env_state, _ = raw(env_state, jax.random.PRNGKey(0))
     roll, peer_steps = _peer(env, num_envs)
-    seconds: dict[str, list[float]] = {"mjx env": [], "training": [], "mujoco": []}
+    seconds: dict[str, list[float]] = {"env": [], "training": [], "Batch": []}
     for k in range(rounds):
         took, (env_state, _) = _timed(lambda s=env_state, k=k: raw(s, jax.random.PRNGKey(k)))
-        seconds["mjx env"].append(took / (decisions * config.task.sim_steps))
+        seconds["env"].append(took / (decisions * config.task.sim_steps))
         took, (state, _) = _timed(lambda s=state: train(s))
         seconds["training"].append(took / (decisions * config.task.sim_steps))
         took, _ = _timed(roll)
-        seconds["mujoco"].append(took / peer_steps)
+        seconds["Batch"].append(took / peer_steps)
     rate = {name: 1 / statistics.median(values) for name, values in seconds.items()}
     device = jax.devices()[0]
     stats = device.memory_stats() or {}
     return {
+        "engine": engine,
         "num_envs": num_envs,
         "preset": preset_name,
         "updates_per_step": config.dqn.updates_per_step(num_envs),
@@ -75,9 +79,9 @@ def measure(num_envs: int, preset_name: str, rounds: int) -> dict[str, Any]:
         "devices_used": config.num_devices,
         "physics_steps_per_second": rate,
         "decisions_per_second": {k: v / config.task.sim_steps for k, v in rate.items()},
-        "mjx_over_mujoco": _ratio(seconds["mujoco"], seconds["mjx env"]),
-        "training_over_mjx": _ratio(seconds["mjx env"], seconds["training"]),
-        "compile_s": {"mjx env": raw_compile, "training": train_compile},
+        "env_over_batch": _ratio(seconds["Batch"], seconds["env"]),
+        "training_over_batch": _ratio(seconds["Batch"], seconds["training"]),
+        "compile_s": {"env": raw_compile, "training": train_compile},
         "peak_host_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "peak_device_memory_mib": stats.get("peak_bytes_in_use", 0) / 2**20 or None,
     }
@@ -180,39 +184,48 @@ def hardware() -> dict[str, Any]:
 def main() -> None:
     """Measures every row and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
+    parser.add_argument("--engines", nargs="+", default=["mjx", "mujoco"])
     parser.add_argument("--num-envs", type=int, nargs="+", default=[64, 256, 1024])
     parser.add_argument("--preset", default="default")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--json", type=Path, help="file to write the figures to")
-    parser.add_argument("--row", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--write", type=Path, help="Markdown file with markers")
+    parser.add_argument("--row", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.row:
-        print(json.dumps(measure(args.row, args.preset, args.rounds)))
+        print(json.dumps(measure(args.engines[0], args.num_envs[0], args.preset, args.rounds)))
         return
     rows = []
     flags = ["--preset", args.preset, "--rounds", str(args.rounds)]
-    for num_envs in args.num_envs:
-        print(f"measuring {num_envs} envs ...", file=sys.stderr, flush=True)
-        command = [sys.executable, __file__, "--row", str(num_envs), *flags]
+    for engine, num_envs in itertools.product(args.engines, args.num_envs):
+        print(f"measuring {engine}, {num_envs} envs ...", file=sys.stderr, flush=True)
+        row = ["--row", "--engines", engine, "--num-envs", str(num_envs), *flags]
+        command = [sys.executable, __file__, *row]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         rows.append(json.loads(done.stdout.splitlines()[-1]))
     machine = hardware()
-    print(f"{machine['cpu']}, {machine['cores']} cores, {rows[0]['device']}; medians of rounds")
-    print("physics steps/s (decisions/s)")
-    print(
-        "| envs | mjx env | training | mujoco Batch | mjx / mujoco | training / mjx "
-        "| compile env, training | host memory |"
-    )
-    print("|---|---|---|---|---|---|---|---|")
+    columns = ["engine", "envs", "env", "training", "Batch", "env / Batch", "training / Batch"]
+    columns += ["compile env, training", "host memory"]
+    cells = []
     for row in rows:
         rates, decisions = row["physics_steps_per_second"], row["decisions_per_second"]
-        cells = [f"{rates[k]:,.0f} ({decisions[k]:,.0f})" for k in rates]
-        compiles = [f"{s:.0f} s" for s in row["compile_s"].values()]
-        print(
-            f"| {row['num_envs']} | {' | '.join(cells)} | {row['mjx_over_mujoco']:.2f} "
-            f"| {row['training_over_mjx']:.2f} | {', '.join(compiles)} "
-            f"| {row['peak_host_memory_mib']:,.0f} MiB |"
+        cells.append(
+            [
+                f"`{row['engine']}`",
+                str(row["num_envs"]),
+                *(f"{rates[k]:,.0f} ({decisions[k]:,.0f})" for k in rates),
+                f"{row['env_over_batch']:.2f}",
+                f"{row['training_over_batch']:.2f}",
+                ", ".join(f"{s:.0f} s" for s in row["compile_s"].values()),
+                f"{row['peak_host_memory_mib']:,.0f} MiB",
+            ]
         )
+    note = (
+        f"{machine['cpu']}, {machine['cores']} cores, {rows[0]['device']}, preset {args.preset}; "
+        "physics steps per second, decisions per second in brackets, medians of "
+        f"{args.rounds} rounds."
+    )
+    publish("throughput", [*table(columns, cells), "", note], args.write)
     if args.json:
         args.json.write_text(json.dumps({"hardware": machine, "rows": rows}, indent=2) + "\n")
 
