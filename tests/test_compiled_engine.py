@@ -203,6 +203,31 @@ def test_the_tilt_of_a_simulation_that_warns_is_no_number(scene: Scene, engine: 
     assert np.isfinite(motion.tilt[::2]).all()
 
 
+def test_no_leg_comes_to_its_limits(compiled: Fleet) -> None:
+    """MJX leaves the limits out. Half a minute of the greatest actions, each held for 2 s.
+
+    Under loads of up to 5 kg and with weak servos; measured: 0.07 rad are left.
+    """
+    scene = compiled.env.scene
+    assert scene.model.jnt_limited.sum() == 12
+    bounds = {scene.model.jnt_qposadr[k]: scene.model.jnt_range[k] for k in range(15)}
+    ranges = np.asarray([[bounds[at] for at in leg] for leg in scene.leg_qpos])
+    lowest, highest = ranges[..., 0], ranges[..., 1]
+    state, rng, left = compiled.reset(keys(0)), np.random.default_rng(0), np.inf
+    actions = rng.choice((0, 20, 420, 440), (15, ENVS)).repeat(10, axis=0)
+    for number, action in enumerate(actions):
+        state = compiled.step(state, jnp.asarray(action))
+        angles = np.asarray(state.pipeline_state.qpos)[:, scene.leg_qpos]
+        left = min(left, float(np.minimum(angles - lowest, highest - angles).min()))
+        over, fresh = np.asarray(state.done) > 0, compiled.reset(keys(1 + number))
+        state = jax.tree.map(
+            lambda new, old: jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old),  # noqa: B023
+            fresh,
+            state,
+        )
+    assert 0.03 < left < 0.3
+
+
 @pytest.mark.parametrize("broken", [np.nan, 1e12])
 def test_a_robot_that_diverges_is_seen_and_leaves_the_others_alone(
     compiled: Fleet, broken: float

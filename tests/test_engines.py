@@ -161,6 +161,7 @@ def test_mjx_solves_as_the_config_says_and_leaves_the_scene_alone(
 
     def put_model(model: Any, *args: Any, **kwargs: Any) -> Any:
         seen.append((model.opt.iterations, model.opt.ls_iterations, model.opt.timestep))
+        assert not model.jnt_limited.any()
         return original(model, *args, **kwargs)
 
     original = mjx.put_model
@@ -172,6 +173,7 @@ def test_mjx_solves_as_the_config_says_and_leaves_the_scene_alone(
     assert seen == [(7, 9, 0.004)]
     assert scene.model.opt.iterations == 100
     assert scene.model.opt.ls_iterations == 50
+    assert scene.model.jnt_limited.sum() == 12
     for name in ("qpos", "qvel", "qacc_warmstart"):
         stance = getattr(scene.stance, name)
         np.testing.assert_allclose(getattr(state, name), stance, rtol=1e-6, atol=1e-7)

@@ -21,6 +21,8 @@ def mjx_engine(scene: Scene) -> Engine:
         model = copy.copy(scene.model)
         model.opt.iterations = scene.config.solver_iterations
         model.opt.ls_iterations = scene.config.line_search_iterations
+        # Rows that MJX would solve at every step, and that never push: heights are clipped.
+        model.jnt_limited[:] = False
         with jax.ensure_compile_time_eval():  # constants, though this runs inside a trace
             return mjx.put_model(model), mjx.make_data(model)
 
