@@ -42,7 +42,8 @@ class EvaluateArgs:
     controller: str | None = None
     """Baseline to evaluate instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     suite: str = "paper"
-    """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, fast, steep."""
+    """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast or
+    steep."""
     scenarios: int = 256
     """How many of them."""
     duration: float = 60.0

@@ -159,6 +159,12 @@ class RandomizationConfig:
     """Servo gains differ by up to this share."""
     latency_share: float = bounded(0.0, least=0, most=1)
     """Share of the envs that take every action one decision late."""
+    push_min: float = bounded(0.0, least=0)
+    """Least speed that a kick gives the trunk, m/s."""
+    push_max: float = bounded(0.0, least=0)
+    """Greatest speed that a kick gives the trunk, m/s; 0: no kicks."""
+    push_period: float = bounded(5.0, above=0)
+    """Time between kicks, s (chosen)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -363,6 +369,14 @@ def check(config: Config) -> Config:
         raise ConfigError(
             f"friction_max is {most or robot.foot_friction}; it must not be less than the least "
             f"friction, {least or robot.foot_friction}"
+        )
+    push_min, push_max = config.randomization.push_min, config.randomization.push_max
+    if push_max < push_min:
+        raise ConfigError(f"push_max is {push_max}; it must not be less than push_min, {push_min}")
+    period, ctrl_dt = config.randomization.push_period, config.task.ctrl_dt
+    if push_max and period < ctrl_dt:
+        raise ConfigError(
+            f"push_period is {period} s; it must not be shorter than ctrl_dt, {ctrl_dt} s"
         )
     return config
 

@@ -13,6 +13,7 @@ from mjx_balance.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names
+from mjx_balance.task.pushes import Pushes, draw_kicks, kick, kicked_decisions
 from mjx_balance.task.randomization import DRAWS, draw_conditions
 from mjx_balance.task.reward import REWARDS
 from mjx_balance.task.symmetry import Symmetries, symmetries
@@ -42,7 +43,9 @@ class BalanceEnv(Env):
         self.scene: Scene = load_scene(self.config)
         self._engine: Engine = make_engine(self.scene)
         self._table = action_table(self.config.task)
-        self._randomised = self.config.randomization != RandomizationConfig()
+        ranges, task = self.config.randomization, self.config.task
+        self._randomised = ranges != RandomizationConfig()
+        self._kicked = kicked_decisions(task, ranges, task.episode_length * task.ctrl_dt)
 
     @property
     def observation_size(self) -> int:
@@ -78,7 +81,8 @@ class BalanceEnv(Env):
           State with obs (obs_size,).
         """
         task, robot = self.config.task, self.scene.robot
-        rng, key_conditions, key_noise = jax.random.split(rng, 3)
+        # No key depends on how many are split off: pushes change no other draw.
+        rng, key_conditions, key_noise, key_kicks = jax.random.split(rng, 4)
         physics = settled(self.scene)
         memory = decision.start(task, robot, jnp.asarray(self.scene.stance.imu, jnp.float32))
         info = {
@@ -94,6 +98,9 @@ class BalanceEnv(Env):
                 "conditions": draw_conditions(self.config.randomization, robot, uniform),
                 "noise_key": key_noise,
             }
+        if len(self._kicked):
+            uniform = jax.random.uniform(key_kicks, (len(self._kicked), 2))
+            info["kicks"] = draw_kicks(self.config.randomization, uniform)
         obs = decision.observation(task, robot, memory, physics.qpos[self.scene.leg_qpos])
         zero = jnp.float32(0.0)
         metrics = dict.fromkeys(
@@ -132,6 +139,9 @@ class BalanceEnv(Env):
             task, robot, info["memory"], change, late, info["scenario"], info["decision"]
         )
         before: Any = state.pipeline_state
+        if "kicks" in info:
+            added = kick(Pushes(info["kicks"], self._kicked), info["decision"])
+            before = before._replace(qvel=before.qvel.at[self.scene.trunk_velocity].add(added))
         moved, motion = self._engine(before, self.scene.ctrl(targets), conditions)
         samples = motion.imu
         if conditions is not None:

@@ -18,9 +18,10 @@ from mjx_balance.controllers import Controller, View
 from mjx_balance.engines.mujoco import Motion, MujocoEngine
 from mjx_balance.policy import Policy, PolicyError
 from mjx_balance.scene import Scene, load_scene
-from mjx_balance.suites import authority, find_suite, make_scenarios
+from mjx_balance.suites import authority, find_suite, make_pushes, make_scenarios
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.actions import action_table
+from mjx_balance.task.pushes import Pushes, kick
 from mjx_balance.task.randomization import Conditions
 from mjx_balance.task.reward import failed
 
@@ -71,11 +72,13 @@ class _Trials:
         scene: Scene,
         scenarios: tilt.Scenario,
         conditions: Conditions | None,
+        pushes: Pushes | None,
         noise_seed: int,
         threads: int | None,
     ):
         count = len(scenarios.phase)
         self.scene, self.task, self.scenarios = scene, scene.config.task, scenarios
+        self.pushes = pushes
         self.engine = MujocoEngine(scene, count, conditions, threads)
         self.table = action_table(self.task)
         # One generator per scenario: its noise is the same whoever runs or falls beside it. The
@@ -103,6 +106,8 @@ class _Trials:
         change = self.table[chosen]
         now = np.full(len(alive), float(number))
         memory, targets = decision.controls(task, robot, self.memory, change, late, some, now)
+        if self.pushes is not None:
+            self.engine.push(alive, kick(self.pushes, number)[alive])
         motion = self.engine.advance(alive, self.scene.ctrl(targets))
         samples = motion.imu
         if self.noisy:
@@ -166,6 +171,7 @@ def roll_out(
     record: bool = False,
     progress: Callable[[float], None] = lambda share: None,
     conditions: Conditions | None = None,
+    pushes: Pushes | None = None,
     noise_seed: int = 0,
 ) -> Rollout:
     """Runs a controller in plain MuJoCo.
@@ -179,13 +185,14 @@ def roll_out(
       record: whether to keep every qpos.
       progress: called with the share done.
       conditions: of every scenario (n,); nominal if none.
+      pushes: of every scenario (n,); none if none.
       noise_seed: seed of the sensor noise.
 
     Returns:
       The rollout of n scenarios.
     """
     decisions = int(np.ceil(duration / scene.config.task.ctrl_dt - 1e-9))
-    trials = _Trials(scene, scenarios, conditions, noise_seed, threads)
+    trials = _Trials(scene, scenarios, conditions, pushes, noise_seed, threads)
     kept = _Record(scene, len(scenarios.phase), decisions, record)
     began = time.perf_counter()
     for number in range(decisions):
@@ -322,6 +329,7 @@ def run_suite(
         record=record,
         progress=progress,
         conditions=conditions if find_suite(suite).randomization != RandomizationConfig() else None,
+        pushes=make_pushes(scene.config, suite, scenarios, duration, seed),
         noise_seed=seed,
     )
 

@@ -64,6 +64,8 @@ class Scene:
     """(2,) addresses of the board servos in ctrl."""
     trunk_quat: np.ndarray
     """(4,) addresses of the trunk's orientation in qpos."""
+    trunk_velocity: np.ndarray
+    """(2,) addresses of the trunk's velocity along the world's x and y in qvel."""
     imu: np.ndarray
     """(6,) addresses of gyro and accelerometer in sensordata."""
     stance: Stance
@@ -162,7 +164,8 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     leg_qpos = np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names])
     leg_ctrl = np.asarray([[model.actuator(n).id for n in leg] for leg in names])
     board = [f"{BOARD}board_{axis}" for axis in "xy"]
-    root = model.joint(f"{ROBOT}{robot.root}").qposadr[0]
+    joint = model.joint(f"{ROBOT}{robot.root}")
+    root = joint.qposadr[0]
     sensors = [model.sensor(f"{ROBOT}{name}") for name in (robot.gyro, robot.accelerometer)]
     imu = np.concatenate([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in sensors])
     return Scene(
@@ -174,6 +177,7 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
         board_qpos=np.asarray([model.joint(n).qposadr[0] for n in board]),
         board_ctrl=np.asarray([model.actuator(n).id for n in board]),
         trunk_quat=np.arange(root + 3, root + 7),
+        trunk_velocity=joint.dofadr[0] + np.arange(2),
         imu=imu,
         stance=settle(config, robot, model, leg_qpos, leg_ctrl, root, imu),
     )

@@ -9,6 +9,7 @@ import numpy as np
 from mjx_balance.config import Config, RandomizationConfig, greatest_incline
 from mjx_balance.robots import find_robot
 from mjx_balance.task import tilt
+from mjx_balance.task.pushes import Pushes, draw_kicks, kicked_decisions
 from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
 
 
@@ -63,6 +64,10 @@ SUITES: dict[str, Suite] = {
     ),
     "gains": Suite("servo gains off by up to 20%", RandomizationConfig(gain_spread=0.2)),
     "latency": Suite("every action one decision late", RandomizationConfig(latency_share=1.0)),
+    "push": Suite(
+        "the trunk kicked to 0.2 to 0.4 m/s in any direction, every 5 s",
+        RandomizationConfig(push_min=0.2, push_max=0.4),
+    ),
     "fast": Suite("board speeds up to what the action set can follow", fast=True),
     "steep": Suite("inclines up to what the legs can reach", steep=True),
 }
@@ -136,3 +141,20 @@ def make_scenarios(
         )
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     return scenario, draw_conditions(chosen.randomization, robot, others[:, :DRAWS])
+
+
+def make_pushes(config: Config, suite: str, scenarios: int, duration: float, seed: int) -> Pushes:
+    """Draws a suite's pushes, for the scenarios of the same arguments.
+
+    Those of scenario k of a seed are the same however many are drawn and however long they last:
+    they come from a generator of their own, told by its last number from those that draw the
+    scenario and its noise (evaluation.py).
+
+    Raises:
+      SuiteError: for an unknown suite.
+    """
+    ranges = find_suite(suite).randomization
+    at = kicked_decisions(config.task, ranges, duration)
+    rngs = [np.random.default_rng((seed, k, 2)) for k in range(scenarios)]
+    uniform = np.asarray([rng.uniform(size=(len(at), 2)) for rng in rngs])
+    return Pushes(draw_kicks(ranges, uniform), at)

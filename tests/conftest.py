@@ -93,7 +93,7 @@ def fleet() -> Fleet:
 
 @pytest.fixture(scope="session")
 def closed_loop(fleet: Fleet) -> list[Any]:
-    """States of 10 s under feedback: the first half of the envs nominal, the others random.
+    """States of 10 s under feedback: half of the envs nominal, the others random and pushed.
 
     No sensor noise, so that plain MuJoCo can be asked for the same.
     """
@@ -104,5 +104,7 @@ def closed_loop(fleet: Fleet) -> list[Any]:
         np.where(plain.reshape(-1, *[1] * (b.ndim - 1)), a, b)
         for a, b in zip(nominal(), drawn, strict=True)
     ]
+    kicks = jnp.where(plain[:, None, None], 0, state.info["kicks"])
+    state = state.replace(info=state.info | {"kicks": kicks})
     act = Feedback(fleet.env.config, fleet.env.scene.robot, EPISODE)
     return drive(fleet, under(state, type(drawn)(*mixed)), act, EPISODE)

@@ -22,7 +22,12 @@ RANDOM = RandomizationConfig(
     friction_max=1.0,
     gain_spread=0.2,
     latency_share=0.5,
+    push_min=0.05,
+    push_max=0.1,
+    push_period=2.5,
 )
+KICKED = np.asarray((13, 25, 38))
+"""Decisions of an episode that begin with a kick: 2.5, 5 and 7.5 s, in decisions of 0.2 s."""
 STAND = 220
 """The action that changes nothing: level 10 of 0 to 20 on both axes."""
 

@@ -65,6 +65,20 @@ def load(name: str, monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     return module
 
 
+def test_a_kick_is_overcome_when_the_twins_part_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decisions of 50 steps of 4 ms, kicked at 2 and 5 of 8, in three scenarios, by hand."""
+    calm = np.full((3, 400), 0.5)
+    pushed = calm.copy()
+    pushed[:, 40:60] = 5.0  # before the first kick
+    pushed[0, 100:125] -= 0.3  # 25 steps
+    pushed[0, 130] += 0.25  # the 31st
+    pushed[0, 140] += 0.15  # as good as none
+    pushed[1, 260:] += 1.0  # to the end
+    expected = [(31, 0), (0, 150), (0, 0)]
+    found = load("pushes", monkeypatch).settling(TaskConfig(), pushed, calm, np.asarray((2, 5)))
+    np.testing.assert_allclose(found, 0.004 * np.asarray(expected))
+
+
 @pytest.fixture
 def results(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     """`benchmarks/results.py`; its simulation gives 0.1 deg everywhere and counts its calls."""

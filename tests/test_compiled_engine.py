@@ -10,6 +10,7 @@ import pytest
 from fleet import (
     ENVS,
     EPISODE,
+    KICKED,
     STAND,
     Feedback,
     Fleet,
@@ -30,6 +31,7 @@ from mjx_balance.engines.mujoco import MujocoEngine
 from mjx_balance.env import BalanceEnv
 from mjx_balance.evaluation import roll_out
 from mjx_balance.scene import Scene, load_scene
+from mjx_balance.task.pushes import Pushes
 from mjx_balance.task.randomization import Conditions, draw_conditions
 from mjx_balance.task.tilt import Scenario
 
@@ -67,6 +69,7 @@ def test_training_and_evaluation_have_the_same_physics(compiled: Fleet) -> None:
         Scenario(**in_double(states[0].info["scenario"])),
         10.0,
         conditions=Conditions(**in_double(states[0].info["conditions"])),
+        pushes=Pushes(np.asarray(states[0].info["kicks"], float), KICKED),
         record=True,
     )
     assert not rollout.fell.any()

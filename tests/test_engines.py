@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from fleet import ENVS, EPISODE, Feedback, Fleet
+from fleet import ENVS, EPISODE, KICKED, Feedback, Fleet
 from mujoco import mjx
 
 from mjx_balance.config import Config
@@ -19,6 +19,7 @@ from mjx_balance.engines.mujoco import MujocoEngine
 from mjx_balance.evaluation import roll_out
 from mjx_balance.scene import Scene, scene_dir
 from mjx_balance.task.decision import Targets
+from mjx_balance.task.pushes import Pushes
 from mjx_balance.task.randomization import Conditions
 from mjx_balance.task.tilt import Scenario
 
@@ -59,6 +60,7 @@ def courses(fleet: Fleet, closed_loop: list[Any]) -> tuple[Course, Course]:
         Scenario(*(np.asarray(x, float) for x in start["scenario"])),
         10.0,
         conditions=Conditions(**double),
+        pushes=Pushes(np.asarray(start["kicks"], float), KICKED),
     )
     assert not rollout.fell.any()
     theirs = Course(
@@ -233,6 +235,27 @@ def test_c_engine_is_mj_step(scene: Scene) -> None:
     assert not motion.warned.any()
     for still in (0, 2):
         np.testing.assert_array_equal(engine.state(np.asarray([still]))[0][0], scene.stance.qpos)
+
+
+def test_a_push_gives_the_robot_its_momentum_at_once(scene: Scene) -> None:
+    """0.3 m/s of 15.2 kg are 4.56 N s along x; no turn, no board, nobody else."""
+    engine, ids = MujocoEngine(scene, 3, threads=1), np.asarray((0, 2))
+    engine.push(ids, np.asarray([(0.3, -0.1), (0.0, 0.2)]))
+    free = scene.model.jnt_dofadr[scene.model.joint("robot/root").id]
+    trunk, board = scene.model.body("robot/trunk").id, scene.model.body("board/board").id
+    for k, (x, y) in enumerate([(0.3, -0.1), (0, 0), (0, 0.2)]):
+        qpos, qvel = engine.state(np.asarray([k]))
+        data = mujoco.MjData(scene.model)
+        data.qpos, data.qvel = qpos[0], qvel[0] - scene.stance.qvel
+        np.testing.assert_allclose(data.qvel[free : free + 3], (x, y, 0), atol=1e-12)
+        assert np.count_nonzero(np.abs(data.qvel) > 1e-12) == np.count_nonzero((x, y))
+        mujoco.mj_forward(scene.model, data)
+        mujoco.mj_subtreeVel(scene.model, data)
+        mass = scene.model.body_subtreemass[trunk]
+        momentum = mass * data.subtree_linvel[trunk]
+        np.testing.assert_allclose(momentum, (15.2 * x, 15.2 * y, 0), atol=1e-3)
+        np.testing.assert_allclose(data.subtree_angmom[trunk], 0, atol=1e-9)
+        np.testing.assert_allclose(data.subtree_linvel[board], 0, atol=1e-12)
 
 
 def test_c_engine_warns_of_the_robot_that_diverges_alone(scene: Scene) -> None:

@@ -1,14 +1,18 @@
 """Domain randomisation in MJX: what differs from env to env, and by how much."""
 
+import dataclasses
 import itertools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from fleet import ENVS, STAND, Fleet, keys, nominal, under
+from fleet import ENVS, KICKED, STAND, Fleet, keys, level, nominal, under
 
+from mjx_balance.config import RandomizationConfig, preset
+from mjx_balance.env import BalanceEnv
 from mjx_balance.task.observation import observation_names
 from mjx_balance.task.randomization import Conditions
 
@@ -16,25 +20,28 @@ MANY = 4_000
 
 
 @pytest.fixture(scope="module")
-def drawn(fleet: Fleet) -> tuple[Conditions, Any]:
-    """Circumstances and scenarios of many resets."""
+def drawn(fleet: Fleet) -> tuple[Conditions, Any, np.ndarray]:
+    """Circumstances, scenarios and kicks of many resets."""
 
     def draw(key: jax.Array) -> Any:
         info = fleet.env.reset(key).info
-        return info["conditions"], info["scenario"]
+        return info["conditions"], info["scenario"], info["kicks"]
 
     return jax.device_get(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), MANY)))
 
 
-def test_circumstances_fill_their_ranges(drawn: tuple[Conditions, Any]) -> None:
-    conditions, _ = drawn
+def test_circumstances_fill_their_ranges(drawn: tuple[Conditions, Any, np.ndarray]) -> None:
+    conditions, _, kicks = drawn
     ranges = {
         "payload": (conditions.payload, 0, 5),
         "x": (conditions.payload_at[:, 0], -0.05, 0.05),
         "y": (conditions.payload_at[:, 1], -0.05, 0.05),
         "friction": (conditions.friction, 0.4, 1.0),
         "gain": (conditions.gain, 0.8, 1.2),
+        "speed": (np.linalg.norm(kicks[:, 2], axis=-1), 0.05, 0.1),
+        "direction": (np.arctan2(kicks[:, 0, 1], kicks[:, 0, 0]), -np.pi, np.pi),
     }
+    assert kicks.shape == (MANY, 3, 2)
     for name, (values, low, high) in ranges.items():
         test = scipy.stats.kstest(values, "uniform", (low, high - low))
         assert test.pvalue > 1e-3, name
@@ -45,9 +52,9 @@ def test_circumstances_fill_their_ranges(drawn: tuple[Conditions, Any]) -> None:
     np.testing.assert_allclose(conditions.imu_noise, np.tile(sigma, (MANY, 1)))
 
 
-def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any]) -> None:
+def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any, np.ndarray]) -> None:
     """A key used twice would tie a payload to a target."""
-    conditions, scenario = drawn
+    conditions, scenario, kicks = drawn
     columns = np.column_stack(
         (
             conditions.payload,
@@ -58,10 +65,54 @@ def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any]) -> No
             scenario.targets[:, 1],
             np.linalg.norm(scenario.targets[:, 1], axis=-1),
             scenario.phase,
+            kicks.reshape(MANY, -1),
         )
     )
     together = scipy.stats.spearmanr(columns).statistic - np.eye(columns.shape[1])
     assert np.abs(together).max() < 0.07
+
+
+def test_a_kick_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: Fleet) -> None:
+    """On level boards, robots given that velocity by hand move alike, whatever the decision."""
+    start = level(under(fleet.reset(keys(5)), nominal()))
+    kicks, physics = np.asarray(start.info["kicks"]), start.pipeline_state
+    free = fleet.env.scene.model.jnt_dofadr[fleet.env.scene.model.joint("robot/root").id]
+
+    def after(decision: int, velocity: np.ndarray) -> Any:
+        info = start.info | {"decision": jnp.full(ENVS, decision, jnp.int32)}
+        given = physics._replace(qvel=physics.qvel.at[:, free : free + 2].add(velocity))
+        state = fleet.step(start.replace(info=info, pipeline_state=given), np.full(ENVS, STAND))
+        return jax.device_get(state)
+
+    none, still = np.zeros((ENVS, 2)), after(1, np.zeros((ENVS, 2)))
+    for decision in (0, 12, 14, 24, 26, 49):
+        imu = after(decision, none).info["memory"].imu
+        np.testing.assert_allclose(imu, still.info["memory"].imu, atol=1e-3)
+    for k, decision in enumerate(KICKED):
+        kicked, by_hand = after(decision, none), after(1, kicks[:, k])
+        for name in ("qpos", "qvel"):
+            ours, theirs = (getattr(s.pipeline_state, name) for s in (kicked, by_hand))
+            np.testing.assert_allclose(ours, theirs, atol=1e-4)
+        shaken = np.abs(kicked.info["memory"].imu - still.info["memory"].imu).max(axis=(1, 2))
+        assert shaken.min() > 0.5, "m/s^2"
+
+
+def test_pushes_change_no_other_draw(fleet: Fleet) -> None:
+    """Training without pushes takes the random numbers that it took before there were any."""
+    config = fleet.env.config
+    calm = dataclasses.replace(config.randomization, push_min=0.0, push_max=0.0)
+    env = BalanceEnv(dataclasses.replace(config, randomization=calm))
+    ours, theirs = (jax.jit(e.reset)(jax.random.PRNGKey(7)) for e in (fleet.env, env))
+    info = {name: value for name, value in ours.info.items() if name != "kicks"}
+    jax.tree.map(np.testing.assert_array_equal, info, theirs.info)
+
+
+def test_nobody_is_kicked_unless_asked_for() -> None:
+    """Nor in an episode that ends, after 60 s, when the first kick is due."""
+    late = RandomizationConfig(push_max=0.2, push_period=60.0)
+    for random in (RandomizationConfig(), late):
+        env = BalanceEnv(dataclasses.replace(preset("default"), randomization=random))
+        assert "kicks" not in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).info
 
 
 SIGMA = np.linspace(0.5, 2, ENVS)[:, None] * np.asarray((0.001, 0.002, 0.003, 0.02, 0.04, 0.06))

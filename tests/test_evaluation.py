@@ -34,6 +34,7 @@ from mjx_balance.policy import PolicyError, make_manifest, save_policy
 from mjx_balance.scene import Scene
 from mjx_balance.suites import SuiteError, make_scenarios
 from mjx_balance.task.observation import observation_names
+from mjx_balance.task.pushes import Pushes
 from mjx_balance.task.randomization import Conditions
 from mjx_balance.task.tilt import Scenario
 
@@ -196,6 +197,71 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
     assert 1 < rollout.tilt.max() < 6
     levels = np.stack(np.divmod(actions.T, 21))
     np.testing.assert_allclose(rollout.action_mm, np.abs(-3 + 0.3 * levels).mean(axis=0), atol=1e-6)
+
+
+def test_kicks_come_between_a_choice_and_its_decision(config: Config, scene: Scene) -> None:
+    """Two worlds of six decisions, kicked before the second and the fifth: every state and sample.
+
+    Whoever chooses has not seen the kick yet.
+    """
+    targets = np.asarray([[(4.0, -2.0)], [(-3.0, 1.0)]])
+    scenarios = Scenario(targets, np.zeros(2), np.full(2, 3.5))
+    kicks = np.asarray([[(0.3, -0.1), (0.0, 0.2)], [(-0.2, 0.25), (0.1, 0.1)]])
+    worlds = [ByHand(scene, 1.0, 0.0, 0.0, False) for _ in range(2)]
+    free = scene.model.jnt_dofadr[scene.model.joint("robot/root").id]
+    actions = np.random.default_rng(1).integers(0, 441, (6, 2))
+
+    def act(view: View) -> np.ndarray:
+        for k, world in enumerate(worlds):
+            np.testing.assert_allclose(view.obs[k], world.observation(config), atol=1e-6)
+            np.testing.assert_allclose(view.imu[k], world.imu[-50:], atol=1e-7)
+            np.testing.assert_allclose(view.qvel[k], world.data.qvel, atol=1e-8)
+            if view.decision in (1, 4):
+                world.data.qvel[free : free + 2] += kicks[k, (1, 4).index(view.decision)]
+            world.decide(actions[view.decision, k], targets[k, 0], 3.5)
+        return actions[view.decision]
+
+    pushes = Pushes(kicks, np.asarray((1, 4)))
+    rollout = roll_out(scene, act, scenarios, 1.2, record=True, pushes=pushes)
+    assert not rollout.fell.any()
+    assert rollout.qpos is not None
+    np.testing.assert_allclose(rollout.qpos, [world.qpos for world in worlds], atol=1e-9)
+
+
+def test_who_stands_gets_its_own_kick_when_others_have_fallen(config: Config, scene: Scene) -> None:
+    """World 0 falls within 1.2 s; the kick after 2 s moves world 1 as it does alone."""
+    scenarios = level_boards(config, 2, 3.0)
+    kicks, at = np.asarray([[(0.3, 0.0)], [(0.0, -0.25)]]), np.asarray((10,))
+    both = roll_out(
+        scene,
+        lambda view: np.where(view.ids == 0, LEFT_UP, STAND),
+        scenarios,
+        3.0,
+        pushes=Pushes(kicks, at),
+    )
+    assert both.fell.tolist() == [True, False]
+    one = Scenario(*(x[1:] for x in scenarios))
+    alone = roll_out(scene, always(STAND), one, 3.0, pushes=Pushes(kicks[1:], at))
+    np.testing.assert_allclose(both.tilt[1], alone.tilt[0], atol=1e-9)
+    assert alone.tilt[0, :500].max() < 0.05 < 0.3 < alone.tilt[0, 500:].max()
+
+
+def test_suite_push_kicks_every_five_seconds(config: Config, scene: Scene) -> None:
+    """What the IMU of robots that stand still reads is that of suite `paper` up to 5 s."""
+    flat = dataclasses.replace(config, task=dataclasses.replace(config.task, max_incline=2.0))
+    scene = dataclasses.replace(scene, config=flat)
+    seen: dict[str, list[np.ndarray]] = {"push": [], "paper": []}
+    for suite, samples in seen.items():
+
+        def act(view: View, samples: list[np.ndarray] = samples) -> np.ndarray:
+            samples.append(view.imu.copy())
+            return np.full(len(view.ids), STAND)
+
+        run_suite(scene, act, suite, 3, 6.0, 1)
+    difference = np.abs(np.asarray(seen["push"]) - seen["paper"]).max(axis=(1, 2, 3))
+    # What is seen at decision 26 happened in decision 25, from 5.0 s on.
+    assert difference[:26].max() < 0.01
+    assert difference[26] > 1
 
 
 def test_tilt_counts_six_from_the_very_step_of_the_fall(config: Config, scene: Scene) -> None:

@@ -17,7 +17,7 @@ FLOORS = (
     ("task", "statistics"),
     (
         *"task.actions task.attitude task.kinematics task.observation task.randomization".split(),
-        *"task.reward task.symmetry task.tilt dqn dqn.heads dqn.devices".split(),
+        *"task.pushes task.reward task.symmetry task.tilt dqn dqn.heads dqn.devices".split(),
     ),
     (
         "task.decision",

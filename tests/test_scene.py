@@ -87,6 +87,8 @@ def test_addresses_are_those_of_the_names(scene: Scene) -> None:
         np.testing.assert_array_equal(model.jnt_axis[joint], np.eye(3)[k])
     root = model.jnt_qposadr[find(kinds.mjOBJ_JOINT, "robot/root")]
     np.testing.assert_array_equal(scene.trunk_quat, root + np.arange(3, 7))
+    dof = model.jnt_dofadr[find(kinds.mjOBJ_JOINT, "robot/root")]
+    np.testing.assert_array_equal(scene.trunk_velocity, dof + np.arange(2))
     gyro, accel = (
         model.sensor_adr[find(kinds.mjOBJ_SENSOR, f"robot/{name}")]
         for name in ("gyro", "accelerometer")

@@ -7,7 +7,15 @@ import pytest
 
 from mjx_balance.config import Config, greatest_incline
 from mjx_balance.robots import Robot
-from mjx_balance.suites import SEEDS, SUITES, SuiteError, authority, find_suite, make_scenarios
+from mjx_balance.suites import (
+    SEEDS,
+    SUITES,
+    SuiteError,
+    authority,
+    find_suite,
+    make_pushes,
+    make_scenarios,
+)
 from mjx_balance.task.randomization import DRAWS
 
 
@@ -71,6 +79,29 @@ def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
     np.testing.assert_array_equal(steep.rate, paper.rate)
 
 
+def test_pushes_by_their_draws(config: Config) -> None:
+    """Kicks of 0.2 to 0.4 m/s every 5 s; a scenario's come from a generator of their own."""
+    pushes = make_pushes(config, "push", 3, 60.0, 5)
+    assert pushes.at.tolist() == [25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 275]
+    for k in range(3):
+        speed, turn = np.random.default_rng((5, k, 2)).uniform(size=(11, 2)).T
+        speed, turn = 0.2 + 0.2 * speed, 2 * np.pi * turn
+        expected = np.stack((speed * np.cos(turn), speed * np.sin(turn)), axis=-1)
+        np.testing.assert_allclose(pushes.kicks[k], expected, atol=1e-12)
+    fewer, shorter = make_pushes(config, "push", 2, 60.0, 5), make_pushes(config, "push", 3, 26, 5)
+    np.testing.assert_array_equal(fewer.kicks, pushes.kicks[:2])
+    np.testing.assert_array_equal(shorter.kicks, pushes.kicks[:, :5])
+
+
+def test_pushes_happen_in_the_world_of_paper_and_in_no_other_suite(config: Config) -> None:
+    push, paper = (make_scenarios(config, name, 4, 60.0, 2) for name in ("push", "paper"))
+    for ours, theirs in zip((*push[0], *push[1]), (*paper[0], *paper[1]), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for name in SUITES:
+        kicks = make_pushes(config, name, 4, 60.0, 2).kicks
+        assert kicks.shape == (4, 11 if name == "push" else 0, 2)
+
+
 def test_a_config_beyond_the_limits_is_left_as_it_is(config: Config) -> None:
     """A board that is faster than can be followed is no slower in `fast`."""
     quick = with_task(config, board_rate=6.0)
@@ -105,7 +136,7 @@ def test_impossible_wishes_are_refused(config: Config) -> None:
 
 
 def test_suites_are_known_by_these_names() -> None:
-    names = "paper corner noise payload friction gains latency fast steep".split()
+    names = "paper corner noise payload friction gains latency push fast steep".split()
     assert set(names) <= set(SUITES)
     assert all(SUITES[name].summary for name in SUITES)
 

@@ -80,6 +80,10 @@ class MujocoEngine:
         """Positions (n, nq) and velocities (n, nv) of scenarios `ids` (n,)."""
         return self._batch.qpos[ids], self._batch.qvel[ids]
 
+    def push(self, ids: np.ndarray, kick: np.ndarray) -> None:
+        """Adds (n, 2) m/s along x and y to the velocity of the trunks of scenarios `ids` (n,)."""
+        self._batch.qvel[ids[:, None], self.scene.trunk_velocity] += kick
+
     def advance(self, ids: np.ndarray, ctrl: np.ndarray) -> Motion:
         """Moves scenarios `ids` (n,) through servo targets (n, sim_steps, nu), rad."""
         out = self._batch.rollout(ctrl.shape[1], ctrl, record=("qpos", "sensordata"), ids=ids)
