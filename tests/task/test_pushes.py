@@ -24,8 +24,8 @@ KICKED = RandomizationConfig(push_min=0.2, push_max=0.4)
         (0.2, 5.0, 5.0, []),
         # 0.5 s is over when decision 3 begins, at 0.6 s; 1.0 s at decision 5; 1.5 s at 8.
         (0.2, 0.5, 2.3, [3, 5, 8, 10]),
-        # 3 * 1.1 is 3.3000000000000003, and 0.3 / 0.1 less than 3: rounding moves no kick.
-        (0.1, 1.1, 4.5, [11, 22, 33, 44]),
+        # 3 * 0.4 is 1.2000000000000002, and 0.3 / 0.1 less than 3: rounding moves no kick.
+        (0.2, 0.4, 1.7, [2, 4, 6, 8]),
         (0.1, 0.3, 1.3, [3, 6, 9, 12]),
         # Two that become due in one decision.
         (0.4, 0.2, 0.9, [1, 1, 2, 2]),
