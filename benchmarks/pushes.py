@@ -88,8 +88,8 @@ def main() -> None:
     columns = ("controller", "falls", "mean", "p95", "max", "p95 without kicks")
     columns += ("half overcome in", "95% in")
     note = (
-        f"{args.scenarios} held-out scenarios of {args.duration:g} s of suite `push`, tilt in deg; a "
-        f"kick is overcome when the tilt stays within {SETTLED:g} deg of what it is without kicks."
+        f"{args.scenarios} held-out scenarios of {args.duration:g} s of suite `push`, tilt in deg; "
+        f"a kick is overcome when the tilt stays within {SETTLED:g} deg of what it is without."
     )
     publish("pushes", [*table(columns, rows), "", note], args.write)
 
