@@ -241,7 +241,7 @@ class Config:
     eval_every: int = bounded(20_000, least=0)
     """Env steps between two validations of the greedy policy during training, in whole calls of
     `log_every`; the end of the run is validated too. 0: never."""
-    validation_scenarios: int = bounded(6, least=1)
+    validation_scenarios: int = bounded(4, least=1)
     """Scenarios per suite of each of them (chosen: they take less than 5% of a run)."""
     validation_duration: float = bounded(20.0, above=0)
     """Length of each of these scenarios, s."""
@@ -286,13 +286,13 @@ _DQN = DQNConfig(
 PRESETS: Mapping[str, Config] = {
     # 64 envs: about what two cores step at the rate at which they learn.
     "paper": Config(preset="paper", num_envs=64),
-    "default": Config(preset="default", task=_TASK, dqn=_DQN),
+    "default": Config(preset="default", num_env_steps=60_000, task=_TASK, dqn=_DQN),
     # All IMU samples of the last three decisions, as means over 20 ms, and these decisions'
-    # commands, under noise of a data sheet, payloads and late actions: what `default` reads off
-    # tiny differences, this one has to average. The greater gamma is for the late actions.
+    # commands, under noise of a data sheet, payloads, late actions and kicks: what `default` reads
+    # off tiny differences, this one has to average. The greater gamma is for the late actions.
     "best": Config(
         preset="best",
-        num_env_steps=140_000,
+        num_env_steps=200_000,
         task=dataclasses.replace(
             _TASK,
             gyro_lags=_LAST_600_MS,
@@ -301,7 +301,12 @@ PRESETS: Mapping[str, Config] = {
             command_lags=(0, 1, 2),
         ),
         randomization=RandomizationConfig(
-            gyro_noise=0.002, accel_noise=0.023, payload=5.0, latency_share=0.15
+            gyro_noise=0.002,
+            accel_noise=0.023,
+            payload=5.0,
+            latency_share=0.15,
+            push_max=0.4,
+            push_period=2.5,
         ),
         dqn=dataclasses.replace(_DQN, gamma=0.4, whiten_floor=0.02),
     ),

@@ -77,7 +77,7 @@ def test_chosen_numbers_are_those_that_the_benchmarks_were_made_with() -> None:
         assert (dqn.epsilon_start, dqn.epsilon_end, dqn.max_grad_norm) == (1.0, 0.05, 10.0)
         assert (config.eval_scenarios, config.eval_duration, config.num_seeds) == (128, 60.0, 1)
         assert (config.eval_every, config.export) == (20_000, "last")
-        assert (config.validation_scenarios, config.validation_duration) == (6, 20.0)
+        assert (config.validation_scenarios, config.validation_duration) == (4, 20.0)
         assert (config.seed, config.num_devices) == (0, None)
         assert (config.randomization.payload_offset, config.randomization.payload_height) == (
             0.05,
@@ -105,10 +105,11 @@ def test_chosen_numbers_are_those_that_the_benchmarks_were_made_with() -> None:
         assert (dqn.mirror, dqn.double, dqn.whiten_steps) == (True, False, 50_000)
     assert (default.dqn.gamma, default.dqn.whiten_floor) == (0.1, 1e-3)
     assert (best.dqn.gamma, best.dqn.whiten_floor) == (0.4, 0.02)
-    assert best.num_env_steps == 140_000
+    assert (default.num_env_steps, best.num_env_steps) == (60_000, 200_000)
     random = best.randomization
     assert (random.gyro_noise, random.accel_noise) == (0.002, 0.023)
     assert (random.payload, random.latency_share) == (5.0, 0.15)
+    assert (random.push_min, random.push_max, random.push_period) == (0.0, 0.4, 2.5)
     assert (random.friction_min, random.friction_max, random.gain_spread) == (None, None, 0.0)
 
 
