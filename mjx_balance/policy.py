@@ -34,6 +34,8 @@ from mjx_balance.task.observation import observation_names, observation_scale
 
 FORMAT = "mjx_balance.policy"
 FORMAT_VERSION = 3
+UPGRADED = 2
+UPGRADE = ", and policies/upgrade.py in the project's repository rewrites files of 2"
 MOST_BYTES = 64 * 2**20
 MOST_MANIFEST = 4 * 2**20
 """Larger files and manifests are no policies, whatever they say."""
@@ -131,8 +133,9 @@ def _read_config(manifest: Any) -> Config:
         raise PolicyError("its manifest is not a JSON object")
     for name, wanted in (("format", FORMAT), ("version", FORMAT_VERSION)):
         if manifest.get(name) != wanted:
+            remedy = UPGRADE if manifest.get(name) == UPGRADED else ""
             raise PolicyError(
-                f"{name} is {shown(manifest.get(name))}; this release reads {wanted!r}"
+                f"{name} is {shown(manifest.get(name))}; this release reads {wanted!r}{remedy}"
             )
     for name, kind in (
         ("config", dict),

@@ -199,6 +199,10 @@ def test_weights_without_a_manifest_are_refused(path: Path) -> None:
         ),
         (lambda w, m: w.pop("head/kernel"), "weight head/kernel is missing"),
         (lambda w, m: m.update(version=99), "version is 99; this release reads 3"),
+        (
+            lambda w, m: m.update(version=2),
+            "version is 2; this release reads 3, and policies/upgrade.py",
+        ),
         (lambda w, m: m.update(format="onnx"), "format is 'onnx'"),
         (lambda w, m: m.pop("scene_hash"), "scene_hash is None; it must be a string"),
         (lambda w, m: m.pop("versions"), "versions is None; it must be a JSON object"),
