@@ -33,7 +33,13 @@ def test_policy_fits_in_the_repository_and_to_the_scene(path: Path) -> None:
 @pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
 @pytest.mark.parametrize(
     ("suite", "mean", "most"),
-    [("corner", 0.12, 1.1), ("noise", 0.12, 1.1), ("payload", 0.12, 1.1), ("latency", 0.3, 2.5)],
+    [
+        ("corner", 0.12, 1.1),
+        ("noise", 0.12, 1.1),
+        ("payload", 0.12, 1.1),
+        ("latency", 0.3, 2.5),
+        ("push", 0.12, 2.5),
+    ],
 )
 def test_policy_balances(path: Path, suite: str, mean: float, most: float) -> None:
     """8 scenarios of 20 s; the figures of the README have more of both."""
