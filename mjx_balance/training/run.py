@@ -124,7 +124,7 @@ def _learn(
     """
     plan = loop.make_plan(config)
     program = learner.train_program(plan.iterations)
-    compiling = display.phase("compiling (about a minute the first time, seconds from then on)")
+    compiling = display.phase("compiling (up to a minute the first time, seconds from then on)")
     with compiling, program_cache.mending_xla_cache(display.say):
         state = stop.run(learner.init, config.seed)
         saved = checkpoints.restore(folder.checkpoints, state, display.say)
