@@ -82,7 +82,6 @@ class Policy:
         self._layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
         if self.radial:
             self._profile, self._stretch = weights["profile"], weights["stretch"]
-            self._points = heads.points(self.factors)
 
     @property
     def fingerprint(self) -> str:
@@ -104,6 +103,13 @@ class Policy:
         Raises:
           ValueError: if obs has another size.
         """
+        return self._head(obs).every()
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        """Index of the best action: () for (obs_size,), (batch,) for (batch, obs_size)."""
+        return self._head(obs).greedy()
+
+    def _head(self, obs: np.ndarray) -> heads.Head:
         obs = x = np.asarray(obs, np.float32)
         if x.ndim not in (1, 2) or x.shape[-1] != self.observation_size:
             raise ValueError(
@@ -114,13 +120,9 @@ class Policy:
             x = np.maximum(x @ kernel + bias, 0.0)
         kernel, bias = self._layers[-1]
         if not self.radial:
-            return heads.added_up(x @ kernel + bias, self.factors)
+            return heads.Added(x @ kernel + bias, self.factors)
         out = np.concatenate((x, obs), axis=-1) @ kernel + bias
-        return heads.radial(out, self._profile, self._stretch, self._points)
-
-    def __call__(self, obs: np.ndarray) -> np.ndarray:
-        """Index of the best action: () for (obs_size,), (batch,) for (batch, obs_size)."""
-        return np.argmax(self.q_values(obs), axis=-1)
+        return heads.Radial(out, self._profile, self._stretch, self.factors)
 
 
 def _read_config(manifest: Any) -> Config:

@@ -21,7 +21,7 @@ FLOORS = (
     ),
     (
         "task.decision",
-        *"dqn.acting dqn.means dqn.networks dqn.replay dqn.losses dqn.whitening".split(),
+        *"dqn.acting dqn.means dqn.networks dqn.replay dqn.whitening".split(),
     ),
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner"),

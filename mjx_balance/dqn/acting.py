@@ -1,5 +1,6 @@
-"""From action values to actions: epsilon-greedy, and noise around what it picks."""
+"""From the best action to the one taken: epsilon-greedy, and noise around what it picks."""
 
+import math
 from collections.abc import Sequence
 
 import jax
@@ -17,12 +18,13 @@ def epsilon(config: DQNConfig, env_steps: jax.Array) -> jax.Array:
     return config.epsilon_start + (config.epsilon_end - config.epsilon_start) * share
 
 
-def epsilon_greedy(key: jax.Array, q_values: jax.Array, rate: jax.Array) -> jax.Array:
-    """Action indices () for values (num_actions,): uniform with probability `rate`."""
+def epsilon_greedy(
+    key: jax.Array, greedy: jax.Array, rate: jax.Array, num_actions: int
+) -> jax.Array:
+    """The action index `greedy` (), or with probability `rate` any, all equally likely."""
     key_which, key_random = jax.random.split(key)
-    random = jax.random.randint(key_random, (), 0, q_values.shape[-1])
-    greedy = jnp.argmax(q_values, axis=-1).astype(random.dtype)
-    return jnp.where(jax.random.bernoulli(key_which, rate), random, greedy)
+    random = jax.random.randint(key_random, (), 0, num_actions)
+    return jnp.where(jax.random.bernoulli(key_which, rate), random, greedy.astype(random.dtype))
 
 
 def exploration_noise(
@@ -46,17 +48,17 @@ def exploration_noise(
 
 
 def explore(
-    key: jax.Array, q_values: jax.Array, rate: jax.Array, factors: Sequence[int], levels: int
+    key: jax.Array, greedy: jax.Array, rate: jax.Array, factors: Sequence[int], levels: int
 ) -> jax.Array:
     """The action () of one env in training.
 
     Args:
       key: PRNG key.
-      q_values: (num_actions,)
+      greedy: () index of the best action.
       rate: () share of random actions.
       factors: sizes of the action index' digits.
       levels: of noise; 0 for none.
     """
     key, key_noise = jax.random.split(key)
-    action = epsilon_greedy(key, q_values, rate)
+    action = epsilon_greedy(key, greedy, rate, math.prod(factors))
     return exploration_noise(key_noise, action, factors, levels) if levels else action

@@ -1,9 +1,11 @@
-"""The last step of a Q-network, from its outputs to one value per action.
+"""The last step of a Q-network: what its outputs say of the actions.
 
 Written once for NumPy (the exported policy) and JAX (training): the array library is that of
-the arguments. An action index is a mixed-radix number with one digit per factor.
+the arguments. An action index is a mixed-radix number with one digit per factor. A head knows
+the value of one action and the best action without valuing all of them.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -11,24 +13,82 @@ from typing import Any
 import numpy as np
 
 
-def added_up(branches: Any, factors: Sequence[int]) -> Any:
-    """The value of an action as the sum of the values of its digits.
+@dataclasses.dataclass(frozen=True)
+class Added:
+    """The value of an action as the sum of the values of its digits."""
 
-    Args:
-      branches: (..., sum(factors)) a value for every digit of every factor.
-      factors: numbers of digits.
+    branches: Any
+    """(..., sum(factors)) a value for every digit of every factor."""
+    factors: tuple[int, ...]
+    """Numbers of digits."""
 
-    Returns:
-      (..., prod(factors))
+    def every(self) -> Any:
+        """Values of all actions, (..., prod(factors))."""
+        first, *others = self._split()
+        for branch in others:
+            first = first[..., :, None] + branch[..., None, :]
+            first = first.reshape(*first.shape[:-2], math.prod(first.shape[-2:]))
+        return first
+
+    def of(self, action: Any) -> Any:
+        """Values (...) of action indices (...)."""
+        xp = self.branches.__array_namespace__()
+        digits = xp.unravel_index(action, self.factors)
+        pairs = zip(self._split(), digits, strict=True)
+        return sum(xp.take_along_axis(x, digit[..., None], axis=-1)[..., 0] for x, digit in pairs)
+
+    def greedy(self) -> Any:
+        """Indices (...) of the best actions: the best digit of every factor."""
+        xp = self.branches.__array_namespace__()
+        return _index([xp.argmax(branch, axis=-1) for branch in self._split()], self.factors)
+
+    def _split(self) -> list[Any]:
+        ends = np.cumsum(self.factors)
+        pairs = zip(ends - self.factors, ends, strict=True)
+        return [self.branches[..., start:end] for start, end in pairs]
+
+
+@dataclasses.dataclass(frozen=True)
+class Radial:
+    """The value of an action by its distance from the best point.
+
+    Q(s, a) = V(s) + alpha * exp(-beta * z) - kappa * z
+    z = sqrt(delta^2 + |exp(stretch) * (x(a) - mu(s))|^2)
     """
-    values = branches[..., : factors[0]]
-    start = factors[0]
-    for levels in factors[1:]:
-        branch = branches[..., start : start + levels]
-        start += levels
-        values = values[..., :, None] + branch[..., None, :]
-        values = values.reshape(*values.shape[:-2], math.prod(values.shape[-2:]))
-    return values
+
+    out: Any
+    """(..., 1 + factors) V and mu."""
+    profile: Any
+    """(4,) alpha, beta, kappa and delta before softplus makes them positive."""
+    stretch: Any
+    """(factors,) logarithm of each axis' scale."""
+    factors: tuple[int, ...]
+    """Numbers of points on each axis."""
+
+    def every(self) -> Any:
+        """Values of all actions, (..., prod(factors))."""
+        return Radial(self.out[..., None, :], self.profile, self.stretch, self.factors).of(
+            np.arange(math.prod(self.factors))
+        )
+
+    def of(self, action: Any) -> Any:
+        """Values (...) of action indices (...)."""
+        xp = self.out.__array_namespace__()
+        alpha, beta, kappa, delta = xp.logaddexp(self.profile, xp.zeros_like(self.profile))
+        away = xp.asarray(points(self.factors))[action] - self.out[..., 1:]
+        z = xp.sqrt(delta**2 + xp.sum((away * xp.exp(self.stretch)) ** 2, axis=-1))
+        return self.out[..., 0] + alpha * xp.exp(-beta * z) - kappa * z
+
+    def greedy(self) -> Any:
+        """Indices (...) of the best actions: on every axis, the point nearest to mu."""
+        xp = self.out.__array_namespace__()
+        last = np.asarray(self.factors, np.float32) - 1
+        nearest = xp.clip(xp.rint((self.out[..., 1:] + 1) * last / 2), 0, last)
+        digits = xp.nan_to_num(nearest).astype(np.int32)
+        return _index([digits[..., k] for k in range(len(self.factors))], self.factors)
+
+
+Head = Added | Radial
 
 
 def points(factors: Sequence[int]) -> np.ndarray:
@@ -38,24 +98,9 @@ def points(factors: Sequence[int]) -> np.ndarray:
     return grid.reshape(-1, len(factors)).astype(np.float32)
 
 
-def radial(out: Any, profile: Any, stretch: Any, points: Any) -> Any:
-    """The value of an action by its distance from the best point.
-
-        Q(s, a) = V(s) + alpha * exp(-beta * z) - kappa * z
-        z = sqrt(delta^2 + |exp(stretch) * (x(a) - mu(s))|^2)
-
-    Args:
-      out: (..., 1 + factors) V and mu.
-      profile: (4,) alpha, beta, kappa and delta before softplus makes them positive.
-      stretch: (factors,) logarithm of each axis' scale.
-      points: (num_actions, factors) x of every action.
-
-    Returns:
-      (..., num_actions)
-    """
-    xp = out.__array_namespace__()
-    value, best = out[..., :1], out[..., 1:]
-    alpha, beta, kappa, delta = xp.logaddexp(profile, xp.zeros_like(profile))
-    away = (points - best[..., None, :]) * xp.exp(stretch)
-    z = xp.sqrt(delta**2 + xp.sum(away**2, axis=-1))
-    return value + alpha * xp.exp(-beta * z) - kappa * z
+def _index(digits: Sequence[Any], factors: Sequence[int]) -> Any:
+    """The action indices (...) that digits (...) make."""
+    index = digits[0]
+    for digit, levels in zip(digits[1:], factors[1:], strict=True):
+        index = index * levels + digit
+    return index

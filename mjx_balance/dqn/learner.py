@@ -25,6 +25,7 @@ from mjx_balance.dqn import replay, whitening
 from mjx_balance.dqn.acting import epsilon, explore
 from mjx_balance.dqn.collecting import Collected, Reset, array, collect, finite, fresh
 from mjx_balance.dqn.devices import AXIS, device_key
+from mjx_balance.dqn.heads import Head
 from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.dqn.replay import ReplayState, Transition
@@ -255,10 +256,10 @@ class Learner:
     ) -> Collected:
         """Takes one decision of each of this device's envs."""
         obs = array(state.env_state.obs)
-        values = self._q_values(self._folded(state.params, state.inputs), obs)
+        greedy = self._q_values(self._folded(state.params, state.inputs), obs).greedy()
         keys = jax.random.split(device_key(key_act), len(obs))
         act = partial(explore, factors=self.action_factors, levels=self.config.exploration_noise)
-        action = jax.vmap(act, (0, 0, None))(keys, values, rate)
+        action = jax.vmap(act, (0, 0, None))(keys, greedy, rate)
         return collect(self.env, state.env_state, action, device_key(key_reset))
 
     def _learn(self, state: TrainState, key: jax.Array) -> tuple[TrainState, dict[str, Mean]]:
@@ -295,7 +296,7 @@ class Learner:
         batch = replay.sample(buffer, key, self.config.batch_size // self.num_devices)
         return batch if self.symmetries is None else mirrored(self.symmetries, batch, key_mirror)
 
-    def _q_values(self, params: Params, obs: jax.Array) -> jax.Array:
-        values = self.network.apply(params, obs)
-        assert isinstance(values, jax.Array)
-        return values
+    def _q_values(self, params: Params, obs: jax.Array) -> Head:
+        head = self.network.apply(params, obs, method="head")
+        assert isinstance(head, Head)
+        return head

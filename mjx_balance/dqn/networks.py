@@ -20,7 +20,7 @@ class QNetwork(nn.Module):
     https://arxiv.org/abs/2010.14680, section 3, hyperedges of rank one).
 
     With `radial`, the levels are points x from -1 to 1 on one axis per factor, and the
-    network says where the best point mu is and what it is worth (`heads.radial`).
+    network says where the best point mu is and what it is worth (`heads.Radial`).
     It is the idea of normalized advantage functions (Gu et al. 2016,
     https://arxiv.org/abs/1603.00748, section 4), a value that falls off around a best
     action, with a learned profile instead of a parabola, on a grid of actions. mu and V
@@ -32,19 +32,23 @@ class QNetwork(nn.Module):
     factors: Sequence[int]
     radial: bool = False
 
-    @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
         """Maps obs (..., obs_size) to action values (..., prod(factors))."""
+        return self.head(obs).every()
+
+    @nn.compact
+    def head(self, obs: jax.Array) -> heads.Head:
+        """The action values of obs (..., obs_size), as a head that can be asked for some."""
         x = obs
         for i, width in enumerate(self.hidden_sizes):
             x = nn.relu(nn.Dense(width, name=f"hidden_{i}")(x))
+        factors = tuple(self.factors)
         if not self.radial:
-            return heads.added_up(nn.Dense(sum(self.factors), name="head")(x), self.factors)
-        features = jnp.concatenate((x, obs), axis=-1)
-        out = nn.Dense(1 + len(self.factors), name="head")(features)
+            return heads.Added(nn.Dense(sum(factors), name="head")(x), factors)
+        out = nn.Dense(1 + len(factors), name="head")(jnp.concatenate((x, obs), axis=-1))
         profile = self.param("profile", nn.initializers.zeros, (4,))
-        stretch = self.param("stretch", nn.initializers.zeros, (len(self.factors),))
-        return heads.radial(out, profile, stretch, heads.points(self.factors))
+        stretch = self.param("stretch", nn.initializers.zeros, (len(factors),))
+        return heads.Radial(out, profile, stretch, factors)
 
     def folded(self, params: Any, mean: jax.Array, matrix: jax.Array) -> Any:
         """Parameters that give for obs what `params` give for (obs - mean) @ matrix.

@@ -9,17 +9,18 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn.devices import AXIS
-from mjx_balance.dqn.losses import td_error
+from mjx_balance.dqn.heads import Head
 from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.replay import Transition
 
 Params: TypeAlias = Any
 """A network's variables, a flax pytree."""
-QValues: TypeAlias = Callable[[Params, jax.Array], jax.Array]
-"""Variables and observations (..., obs_size) -> action values (..., num_actions)."""
+QValues: TypeAlias = Callable[[Params, jax.Array], Head]
+"""Variables and observations (..., obs_size) -> the values of their actions."""
 
 
 class LearnerState(NamedTuple):
@@ -77,15 +78,19 @@ def mirrored(symmetries: Symmetries, batch: Transition, key: jax.Array) -> Trans
 def loss(
     params: Params, target_params: Params, batch: Transition, q_values: QValues, config: DQNConfig
 ) -> jax.Array:
-    """Mean squared TD error () of a batch (paper Eq. 1), or of Double DQN."""
-    q_tm1 = q_values(params, batch.obs)
-    q_t = q_values(target_params, batch.next_obs)
+    """Mean squared TD error () of a batch.
+
+    The error is r + discount * max_a q'(s', a) - q(s, a), where q' is the target network and
+    the discount is 0 after a termination (paper Eq. 1). With `double` the online network
+    chooses the a that q' values (Double DQN, van Hasselt et al. 2015,
+    https://arxiv.org/abs/1509.06461, Eq. 4).
+    """
+    q_tm1 = q_values(params, batch.obs).of(batch.action)
+    target = q_values(target_params, batch.next_obs)
+    selector = q_values(params, batch.next_obs) if config.double else target
+    q_t = target.of(selector.greedy())
     discount_t = config.gamma * (1 - batch.terminated)
-    selector = q_values(params, batch.next_obs) if config.double else None
-    error = jax.vmap(td_error, (0, 0, 0, 0, 0, None if selector is None else 0))(
-        q_tm1, batch.action, batch.reward, discount_t, q_t, selector
-    )
-    return jnp.mean(error**2)
+    return jnp.mean((batch.reward + discount_t * q_t - q_tm1) ** 2)
 
 
 def update(
@@ -114,7 +119,7 @@ def update(
         return loss(fold(params), state.target_params, batch, q_values, config)
 
     value: jax.Array
-    value, grads = jax.lax.pmean(jax.value_and_grad(whitened_loss)(state.params), AXIS)
+    value, grads = _mean_over_devices(jax.value_and_grad(whitened_loss)(state.params))
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
     gradient_steps = state.gradient_steps + 1
@@ -127,3 +132,9 @@ def update(
     made = LearnerState(params, target_params, opt_state, gradient_steps)
     kept = jax.tree.map(lambda new, old: jnp.where(sound, new, old), made, state)
     return kept, Mean(jnp.where(sound, value, 0.0), sound.astype(jnp.float32))
+
+
+def _mean_over_devices(tree: Any) -> Any:
+    """One exchange for all arrays: each that there is makes the devices wait for each other."""
+    flat, unflatten = ravel_pytree(tree)
+    return unflatten(jax.lax.pmean(flat, AXIS))

@@ -31,9 +31,8 @@ def test_epsilon_may_rise_or_stand_still() -> None:
 @pytest.mark.parametrize("rate", [0.0, 0.3, 1.0])
 def test_every_action_is_as_likely_as_epsilon_greedy_says(rate: float) -> None:
     """Five actions: rate / 5 each, and 1 - rate more for the best."""
-    q_values = jnp.asarray([0.0, -1.0, 3.0, 2.9, 1.0])
-    draw = jax.vmap(epsilon_greedy, (0, None, None))
-    drawn = np.asarray(draw(KEYS, q_values, jnp.float32(rate)))
+    draw = jax.vmap(lambda key: epsilon_greedy(key, jnp.int32(2), jnp.float32(rate), 5))
+    drawn = np.asarray(draw(KEYS))
     shares = np.bincount(drawn, minlength=5) / len(KEYS)
     expected = np.full(5, rate / 5)
     expected[2] += 1 - rate
@@ -71,7 +70,7 @@ def test_noise_is_independent_of_the_action_that_it_moves() -> None:
 
     An action moved by its own draw would end at the last one in 3 of 9 cases, not in 15 of 81.
     """
-    draw = jax.vmap(lambda key: explore(key, jnp.zeros(9), jnp.float32(1.0), (9,), 4))
+    draw = jax.vmap(lambda key: explore(key, jnp.int32(0), jnp.float32(1.0), (9,), 4))
     shares = np.bincount(draw(KEYS), minlength=9) / len(KEYS)
     expected = np.zeros(9)
     for action in range(9):
@@ -81,6 +80,5 @@ def test_noise_is_independent_of_the_action_that_it_moves() -> None:
 
 
 def test_without_noise_the_greedy_action_is_taken() -> None:
-    q_values = jnp.asarray([0.0, 5.0, 1.0])
-    draw = jax.vmap(lambda key: explore(key, q_values, jnp.float32(0.0), (3,), 0))
+    draw = jax.vmap(lambda key: explore(key, jnp.int32(1), jnp.float32(0.0), (3,), 0))
     assert set(np.asarray(draw(KEYS)).tolist()) == {1}

@@ -76,17 +76,72 @@ def test_radial_values_by_hand() -> None:
             assert values[i, j] == pytest.approx(expected, abs=1e-5)
 
 
+def some_heads(batch: tuple[int, ...], seed: int) -> list[heads.Head]:
+    """One of each kind, of 3 x 4 x 2 actions; mu lies in the grid or beyond it."""
+    rng = np.random.default_rng(seed)
+    factors = (3, 4, 2)
+    branches, out, profile, stretch = (
+        rng.normal(size=(*shape,)).astype(np.float32)
+        for shape in ((*batch, 9), (*batch, 4), (4,), (3,))
+    )
+    joint = rng.normal(size=(*batch, 24)).astype(np.float32)
+    return [
+        heads.Added(joint, (24,)),
+        heads.Added(branches, factors),
+        heads.Radial(out, profile, stretch, factors),
+    ]
+
+
+def in_jax(head: heads.Head) -> heads.Head:
+    if isinstance(head, heads.Added):
+        return heads.Added(jnp.asarray(head.branches), head.factors)
+    out, profile, stretch = map(jnp.asarray, (head.out, head.profile, head.stretch))
+    return heads.Radial(out, profile, stretch, head.factors)
+
+
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 def test_heads_give_numpy_and_jax_the_same(batch: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(3)
-    branches, out = rng.normal(size=(*batch, 7)), rng.normal(size=(*batch, 3))
-    rest = rng.normal(size=4), rng.normal(size=2), heads.points((3, 4))
-    plain = heads.added_up(branches, (3, 4)), heads.radial(out, *rest)
-    traced = heads.added_up(jnp.asarray(branches), (3, 4)), heads.radial(jnp.asarray(out), *rest)
-    for a, b in zip(plain, traced, strict=True):
-        assert type(a) is np.ndarray
-        assert a.shape == (*batch, 12)
-        np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5)
+    rng = np.random.default_rng(4)
+    action = rng.integers(24, size=batch)
+    for plain in some_heads(batch, 3):
+        traced = in_jax(plain)
+        for a, b in (
+            (plain.every(), traced.every()),
+            (plain.of(action), traced.of(jnp.asarray(action))),
+            (plain.greedy(), traced.greedy()),
+        ):
+            assert not isinstance(a, jax.Array)
+            assert isinstance(b, jax.Array)
+            assert a.shape == b.shape
+            np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("batch", [(), (50,), (2, 30)])
+def test_value_of_one_action_and_the_best_one_are_those_of_all_values(
+    batch: tuple[int, ...],
+) -> None:
+    action = np.random.default_rng(5).integers(24, size=batch)
+    best = set()
+    for seed in range(5):
+        for head in some_heads(batch, seed):
+            every = head.every()
+            assert every.shape == (*batch, 24)
+            wanted = np.take_along_axis(every, action[..., None], axis=-1)[..., 0]
+            np.testing.assert_allclose(head.of(action), wanted, rtol=1e-6, atol=1e-6)
+            np.testing.assert_array_equal(head.greedy(), every.argmax(axis=-1))
+            best |= set(np.ravel(head.greedy()).tolist())
+    assert not batch or len(best) > 15, "some of them inside the grid, some on its edge"
+
+
+def test_what_is_not_a_number_is_worth_an_action_all_the_same() -> None:
+    """A robot that diverged observes NaN; it is counted as fallen, and stops nobody."""
+    for head in some_heads((2,), 0):
+        name = "branches" if isinstance(head, heads.Added) else "out"
+        array = vars(head)[name].copy()
+        array[0] = np.nan
+        greedy = type(head)(**vars(head) | {name: array}).greedy()
+        assert 0 <= greedy[0] < 24
+        assert greedy[1] == head.greedy()[1]
 
 
 def test_points_of_the_radial_head_follow_the_index() -> None:

@@ -11,8 +11,9 @@ import probes
 import pytest
 
 from mjx_balance.config import DQNConfig
+from mjx_balance.dqn.heads import Added
 from mjx_balance.dqn.replay import Transition
-from mjx_balance.dqn.updating import make_optimizer, mirrored
+from mjx_balance.dqn.updating import loss, make_optimizer, mirrored
 from mjx_balance.task.symmetry import Symmetries
 
 COUNT = 400
@@ -87,3 +88,47 @@ def test_a_run_without_an_update_has_a_schedule_all_the_same() -> None:
     optimizer = make_optimizer(CONFIG, 0)
     update, _ = optimizer.update(jnp.ones(()), optimizer.init(jnp.zeros(())))
     assert math.isfinite(float(np.asarray(update)))
+
+
+Q_TM1, Q_T, SELECTOR = ([1.0, 2.0, 3.0], [4.0, -1.0, 2.0], [0.0, 9.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("double", "terminated", "error"),
+    [(False, 0.0, 0.5 + 0.1 * 4 - 2), (True, 0.0, 0.5 + 0.1 * -1 - 2), (False, 1.0, 0.5 - 2)],
+)
+def test_loss_by_hand(double: bool, terminated: float, error: float) -> None:
+    """Action 1 of three; the online network prefers action 1 in the next state.
+
+    The gradient reaches the value of the action taken and nothing else.
+    """
+    tables = {"online": [Q_TM1, SELECTOR], "target": [[9.0, 9.0, 9.0], Q_T]}
+    params, target = (jnp.asarray(tables[name]) for name in ("online", "target"))
+    states = jnp.asarray([[0], [1]])
+    action, reward, ended = map(jnp.asarray, ([1], [0.5], [terminated]))
+    batch = Transition(states[:1], action, reward, ended, states[1:])
+
+    def q_values(table: jax.Array, state: jax.Array) -> Added:
+        return Added(table[state[:, 0]], (3,))
+
+    config = DQNConfig(gamma=0.1, double=double)
+    value, (by_params, by_target) = jax.value_and_grad(loss, (0, 1))(
+        params, target, batch, q_values, config
+    )
+    assert float(value) == pytest.approx(error**2)
+    np.testing.assert_allclose(by_params, [[0, -2 * error, 0], [0, 0, 0]], rtol=1e-5)
+    bootstrapped = 0 if terminated else 2 * error * 0.1
+    wanted = np.zeros((2, 3))
+    wanted[1, 1 if double else 0] = bootstrapped
+    np.testing.assert_allclose(by_target, wanted, atol=1e-6)
+
+
+def test_loss_is_the_mean_over_the_batch() -> None:
+    rng = np.random.default_rng(0)
+    q_tm1, q_t = rng.normal(size=(2, 5, 3))
+    action, reward = np.asarray([0, 1, 2, 1, 0]), np.arange(5.0)
+    ended = np.asarray([0.0, 1, 0, 0, 1])
+    batch = Transition(*map(jnp.asarray, (q_tm1, action, reward, ended, q_t)))
+    got = loss(None, None, batch, lambda _, obs: Added(obs, (3,)), DQNConfig(gamma=0.3))
+    errors = reward + 0.3 * (1 - ended) * q_t.max(axis=-1) - q_tm1[np.arange(5), action]
+    assert float(got) == pytest.approx(np.mean(errors**2), rel=1e-5)
