@@ -59,14 +59,14 @@ def measure(engine: Any, num_envs: int, preset_name: str, rounds: int) -> dict[s
         state, _ = train(state)
     env_state, _ = raw(env_state, jax.random.PRNGKey(0))
     roll, peer_steps = _peer(env, num_envs)
-    seconds: dict[str, list[float]] = {"env": [], "training": [], "Batch": []}
+    seconds: dict[str, list[float]] = {"env": [], "training": [], "batch": []}
     for k in range(rounds):
         took, (env_state, _) = _timed(lambda s=env_state, k=k: raw(s, jax.random.PRNGKey(k)))
         seconds["env"].append(took / (decisions * config.task.sim_steps))
         took, (state, _) = _timed(lambda s=state: train(s))
         seconds["training"].append(took / (decisions * config.task.sim_steps))
         took, _ = _timed(roll)
-        seconds["Batch"].append(took / peer_steps)
+        seconds["batch"].append(took / peer_steps)
     rate = {name: 1 / statistics.median(values) for name, values in seconds.items()}
     device = jax.devices()[0]
     stats = device.memory_stats() or {}
@@ -79,8 +79,8 @@ def measure(engine: Any, num_envs: int, preset_name: str, rounds: int) -> dict[s
         "devices_used": config.num_devices,
         "physics_steps_per_second": rate,
         "decisions_per_second": {k: v / config.task.sim_steps for k, v in rate.items()},
-        "env_over_batch": _ratio(seconds["Batch"], seconds["env"]),
-        "training_over_batch": _ratio(seconds["Batch"], seconds["training"]),
+        "env_over_batch": _ratio(seconds["batch"], seconds["env"]),
+        "training_over_batch": _ratio(seconds["batch"], seconds["training"]),
         "compile_s": {"env": raw_compile, "training": train_compile},
         "peak_host_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "peak_device_memory_mib": stats.get("peak_bytes_in_use", 0) / 2**20 or None,
@@ -123,9 +123,12 @@ def _compiled(program: Callable[..., Any], state: Any) -> tuple[Callable[..., An
     import jax
     from brax.envs.base import State
 
+    from mjx_balance.training.program_cache import compiler_options
+
     arguments = (state, jax.random.PRNGKey(0)) if isinstance(state, State) else (state,)
     began = time.perf_counter()
-    return program.lower(*arguments).compile(), time.perf_counter() - began  # pyright: ignore
+    lowered = program.lower(*arguments)  # pyright: ignore
+    return lowered.compile(compiler_options()), time.perf_counter() - began
 
 
 def _peer(env, num_envs: int) -> tuple[Callable[[], Any], int]:

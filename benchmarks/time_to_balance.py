@@ -3,10 +3,10 @@
 Every contender is a fresh process. Its clock runs from its start, imports and compiling
 included, to its exported policy, which then has to show what it can do, off the clock: mean tilt
 and falls in the headline suites, held-out scenarios of 60 s, plain MuJoCo. Ours are
-`train.py --engine ENGINE`, cold (no program in the cache) and warm (the same again). The peer is
-stable-baselines3's DQN on one env of the same task (`sb3_dqn.py`): it stands still while its
-checkpoints are judged, and its time is that of the first with a mean of at most `--threshold`
-deg in suite `paper` and no fall.
+`train.py --preset quick --engine ENGINE`, cold (no program in the cache) and warm (the same again).
+The peer is stable-baselines3's DQN on one env of the same task (`sb3_dqn.py`): it stands still
+while its checkpoints are judged, and its time is that of the first with a mean of at most
+`--threshold` deg in suite `paper` and no fall.
 
     python benchmarks/time_to_balance.py [--contenders mujoco mjx sb3] [--json FILE]
 """
@@ -34,6 +34,7 @@ from mjx_balance.suites import HEADLINE, SEEDS
 
 HERE = Path(__file__).resolve().parent
 ENGINES = ("mujoco", "mjx")
+PRESET = "quick"
 PEER = "sb3"
 SCENARIOS, DURATION = 64, 60.0
 POLL = 0.02
@@ -59,7 +60,8 @@ def ours(engine: str, decisions: int, work: Path, display: Display) -> Iterator[
     for start in ("cold", "warm"):
         display.say(f"{engine}, {start}:")
         folder = RunFolder(work / f"{engine}-{start}")
-        flags = f"--engine {engine} --num-env-steps {decisions} --run-dir {folder.path}".split()
+        flags = f"--preset {PRESET} --engine {engine} --num-env-steps {decisions}".split()
+        flags += ["--run-dir", str(folder.path)]
         command = [sys.executable, str(HERE.parent / "train.py"), *flags]
         seconds = time_to_file(command, folder.policy, work / f"cache-{engine}")
         training = load_policy(folder.policy).manifest["training"]
@@ -188,7 +190,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
     names = (*ENGINES, PEER)
     parser.add_argument("--contenders", nargs="+", default=names, choices=names)
-    parser.add_argument("--decisions", type=int, default=20_000, help="of our trainings")
+    parser.add_argument("--decisions", type=int, default=8_192, help="of our trainings")
     parser.add_argument("--threshold", type=float, default=0.20, help=f"that {PEER} reaches, deg")
     parser.add_argument("--most", type=int, default=200_000, help=f"decisions of {PEER} at most")
     parser.add_argument("--every", type=int, default=5_000, help="decisions between checkpoints")

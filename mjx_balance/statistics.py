@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -16,6 +15,8 @@ def interquartile_mean(values: Sequence[float]) -> float:
 
     https://arxiv.org/abs/2108.13264, section 4.3
     """
+    from scipy import stats  # half a second that a training's start need not wait for
+
     return float(stats.trim_mean(np.asarray(values, float), 0.25))
 
 
@@ -24,6 +25,8 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
 
     A single value, or equal values, is its own interval.
     """
+    from scipy import stats
+
     data = np.asarray(values, float)
     if np.ptp(data) == 0:
         return float(data[0]), float(data[0])

@@ -321,7 +321,7 @@ def test_a_warm_start_is_the_same_again(
     ]
     assert [existed for _, _, existed in asked] == [False, True, False, True]
     assert asked[0] == (*asked[1][:2], False)
-    assert "train.py --engine mjx --num-env-steps 640 --run-dir" in asked[0][0]
+    assert "train.py --preset quick --engine mjx --num-env-steps 640 --run-dir" in asked[0][0]
     trained = load_policy(shipped).manifest["training"]["env_steps"]
     assert rows[0] == {
         "contender": "mjx",

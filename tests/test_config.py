@@ -97,20 +97,31 @@ def test_chosen_numbers_are_those_that_the_benchmarks_were_made_with() -> None:
     for config in (default, best):
         task, dqn = config.task, config.dqn
         assert (task.square_share, task.reward_tilt) == (0.5, "mean")
-        assert (dqn.batch_size, dqn.replay_ratio, dqn.target_update_period) == (512, 64, 200)
-        assert (dqn.exploration_noise, dqn.learning_rate_end_share) == (2, 1e-5 / 3e-3)
+        assert (dqn.batch_size, dqn.target_update_period) == (256, 200)
+        assert (dqn.exploration_noise, dqn.learning_rate_end_share) == (2, 1 / 300)
         assert (task.reward_toward, task.reward_toward_scale) == (1.0, 2.5)
-        assert (dqn.head, dqn.hidden_sizes, dqn.learning_rate) == ("radial", (64, 64), 3e-3)
-        assert (dqn.min_replay_size, dqn.epsilon_decay_steps) == (2_048, 10_000)
+        assert (dqn.head, dqn.hidden_sizes) == ("radial", (64, 64))
+        assert (dqn.min_replay_size, dqn.epsilon_decay_steps) == (1_024, 5_000)
         assert (dqn.mirror, dqn.double, dqn.whiten_steps) == (True, False, 50_000)
     assert (default.dqn.gamma, default.dqn.whiten_floor) == (0.1, 1e-3)
     assert (best.dqn.gamma, best.dqn.whiten_floor) == (0.4, 0.02)
-    assert (default.num_env_steps, best.num_env_steps) == (60_000, 200_000)
+    assert (default.dqn.learning_rate, default.dqn.replay_ratio) == (1e-2, 32)
+    assert (best.dqn.learning_rate, best.dqn.replay_ratio) == (5e-3, 64)
+    assert (default.num_env_steps, best.num_env_steps) == (40_000, 250_000)
     random = best.randomization
     assert (random.gyro_noise, random.accel_noise) == (0.002, 0.023)
     assert (random.payload, random.latency_share) == (5.0, 0.15)
     assert (random.push_min, random.push_max, random.push_period) == (0.0, 0.4, 2.5)
     assert (random.friction_min, random.friction_max, random.gain_spread) == (None, None, 0.0)
+
+
+def test_preset_quick_replays_few_decisions_often() -> None:
+    quick, default = preset("quick"), preset("default")
+    assert (quick.num_env_steps, quick.dqn.replay_ratio) == (8_192, 128)
+    assert (quick.dqn.epsilon_decay_steps, quick.eval_every) == (3_000, 0)
+    dqn = dataclasses.replace(quick.dqn, replay_ratio=32, epsilon_decay_steps=5_000)
+    like = dataclasses.replace(quick, preset="default", num_env_steps=40_000, dqn=dqn)
+    assert dataclasses.replace(like, eval_every=default.eval_every) == default
 
 
 def test_preset_smoke_is_the_default_made_small() -> None:
@@ -343,7 +354,7 @@ def test_no_number_may_be_infinite(section: str, name: str, value: float) -> Non
     ("values", "words"),
     [
         ({"seed": 2**31 - 5, "num_seeds": 6}, ("seed is", "2**31")),
-        ({"preset": "papr"}, ("papr", "paper, default, best, smoke")),
+        ({"preset": "papr"}, ("papr", "paper, default, best, quick, smoke")),
         ({"export": "first"}, ("export is 'first'; it must be one of last, best",)),
         ({"export": "best", "eval_every": 0}, ("export is 'best', but eval_every is 0",)),
     ],

@@ -22,7 +22,9 @@ def test_the_papers_dqn_takes_one_gradient_step_per_decision() -> None:
     assert config.dqn.batch_size == 32
 
 
-@pytest.mark.parametrize(("name", "samples"), [("default", 64), ("best", 64), ("smoke", 32)])
+@pytest.mark.parametrize(
+    ("name", "samples"), [("default", 32), ("best", 64), ("quick", 128), ("smoke", 32)]
+)
 @pytest.mark.parametrize("num_envs", [None, 64, 512, 2_048])
 def test_the_replay_ratio_does_not_depend_on_the_number_of_envs(
     name: str, samples: int, num_envs: int | None
@@ -37,7 +39,7 @@ def test_the_replay_ratio_does_not_depend_on_the_number_of_envs(
 
 def test_a_ratio_that_makes_no_whole_number_of_updates_is_refused() -> None:
     config = dataclasses.replace(preset("default"), num_envs=100)
-    with pytest.raises(ConfigError, match=r"replay_ratio is 64: with num_envs 100 .* 12\.5"):
+    with pytest.raises(ConfigError, match=r"replay_ratio is 32: with num_envs 100 .* 12\.5"):
         check(config)
 
 

@@ -154,6 +154,9 @@ class Learner:
           iterations: decisions of every env per call. Metrics are means over what happened
             in them, with a leading seed axis if there are several seeds; NaN if nothing did,
             as for the loss of a call without an update.
+
+        Wait for a call before the next but a few: XLA holds back a CPU device's launch while 32
+        are on their way, and the other devices wait for it for ever.
         """
         iteration = self._each_seed(self.iteration, in_axes=(0, None))
 

@@ -11,7 +11,7 @@ from mjx_balance.config import Config, ConfigError
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.policy import Policy, PolicyError, load_policy, save_policy
-from mjx_balance.report import figures, measuring, tables
+from mjx_balance.report import tables
 from mjx_balance.run_folder import RunFolder, write_atomically, write_json
 from mjx_balance.statistics import over_seeds
 from mjx_balance.suites import HEADLINE, SEEDS
@@ -115,6 +115,8 @@ def finish(
 
 
 def _draw(folder: RunFolder) -> None:
+    from mjx_balance.report import figures, measuring  # matplotlib: not before learning begins
+
     policy = load_policy(folder.policy)
     lines = [json.loads(text) for text in folder.metrics.read_text().splitlines()]
     shown = measuring.recorded(policy, "paper", measuring.RECORD_SECONDS, SEEDS.record)

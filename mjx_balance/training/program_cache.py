@@ -41,6 +41,10 @@ FLAGS = (
 """Settings of JAX that change what a trace gives."""
 XLA_DAMAGED = "Error reading persistent compilation cache entry for '"
 
+CPU_OPTIONS = {"xla_cpu_multi_thread_eigen": False}
+"""Of XLA. Every core is a device: products that spread over all cores would only wait for those
+of the other devices."""
+
 Say: TypeAlias = Callable[[str], None]
 """Takes one line for the user."""
 
@@ -116,6 +120,11 @@ def program_key(config: Config, iterations: int, root: str) -> str:
     return key.hexdigest()[:32]
 
 
+def compiler_options() -> dict[str, bool]:
+    """XLA's options for programs that run on all of this machine's devices."""
+    return CPU_OPTIONS if jax.devices()[0].platform == "cpu" else {}
+
+
 def compile_program(
     program: Callable[[Any], tuple[Any, Any]], state: Any, key: str, say: Say
 ) -> Callable[[Any], tuple[Any, Any]]:
@@ -143,7 +152,8 @@ def compile_program(
         ours = [export.DisabledSafetyCheck.custom_call(name) for name in ffi.registered()]
         exported = export.export(jax.jit(flat, donate_argnums=0), disabled_checks=ours)(leaves)
         _store(path, exported, say)
-    compiled = jax.jit(exported.call, donate_argnums=0).lower(leaves).compile()
+    lowered = jax.jit(exported.call, donate_argnums=0).lower(leaves)
+    compiled = lowered.compile(compiler_options())
 
     def run(state: Any) -> tuple[Any, Any]:
         leaves, output = compiled(jax.tree.leaves(state))
