@@ -41,7 +41,7 @@ FLAGS = (
 """Settings of JAX that change what a trace gives."""
 XLA_DAMAGED = "Error reading persistent compilation cache entry for '"
 
-CPU_OPTIONS = {"xla_cpu_multi_thread_eigen": False}
+CPU_OPTIONS: dict[str, str | bool] = {"xla_cpu_multi_thread_eigen": False}
 """Of XLA. Every core is a device: products that spread over all cores would only wait for those
 of the other devices."""
 
@@ -120,7 +120,7 @@ def program_key(config: Config, iterations: int, root: str) -> str:
     return key.hexdigest()[:32]
 
 
-def compiler_options() -> dict[str, bool]:
+def compiler_options() -> dict[str, str | bool]:
     """XLA's options for programs that run on all of this machine's devices."""
     return CPU_OPTIONS if jax.devices()[0].platform == "cpu" else {}
 
