@@ -292,7 +292,8 @@ PRESETS: Mapping[str, Config] = {
     # off tiny differences, this one has to average. The greater gamma is for the late actions.
     "best": Config(
         preset="best",
-        num_env_steps=250_000,
+        num_env_steps=200_000,
+        log_every=2_048,
         task=dataclasses.replace(
             _TASK,
             gyro_lags=_LAST_600_MS,
@@ -308,8 +309,16 @@ PRESETS: Mapping[str, Config] = {
             push_max=0.4,
             push_period=2.5,
         ),
+        # `default`'s haste costs a seventh of the mean tilt in suite `corner` here.
         dqn=dataclasses.replace(
-            _DQN, gamma=0.4, learning_rate=5e-3, replay_ratio=64, whiten_floor=0.02
+            _DQN,
+            gamma=0.4,
+            learning_rate=3e-3,
+            batch_size=512,
+            replay_ratio=64,
+            min_replay_size=2_048,
+            epsilon_decay_steps=10_000,
+            whiten_floor=0.02,
         ),
     ),
     # Few decisions, each replayed often: a policy that balances within seconds.

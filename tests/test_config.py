@@ -97,17 +97,19 @@ def test_chosen_numbers_are_those_that_the_benchmarks_were_made_with() -> None:
     for config in (default, best):
         task, dqn = config.task, config.dqn
         assert (task.square_share, task.reward_tilt) == (0.5, "mean")
-        assert (dqn.batch_size, dqn.target_update_period) == (256, 200)
-        assert (dqn.exploration_noise, dqn.learning_rate_end_share) == (2, 1 / 300)
+        assert (dqn.target_update_period, dqn.exploration_noise) == (200, 2)
+        assert dqn.learning_rate_end_share == 1 / 300
         assert (task.reward_toward, task.reward_toward_scale) == (1.0, 2.5)
         assert (dqn.head, dqn.hidden_sizes) == ("radial", (64, 64))
-        assert (dqn.min_replay_size, dqn.epsilon_decay_steps) == (1_024, 5_000)
         assert (dqn.mirror, dqn.double, dqn.whiten_steps) == (True, False, 50_000)
     assert (default.dqn.gamma, default.dqn.whiten_floor) == (0.1, 1e-3)
     assert (best.dqn.gamma, best.dqn.whiten_floor) == (0.4, 0.02)
-    assert (default.dqn.learning_rate, default.dqn.replay_ratio) == (1e-2, 32)
-    assert (best.dqn.learning_rate, best.dqn.replay_ratio) == (5e-3, 64)
-    assert (default.num_env_steps, best.num_env_steps) == (40_000, 250_000)
+    assert (default.dqn.learning_rate, best.dqn.learning_rate) == (1e-2, 3e-3)
+    assert (default.dqn.batch_size, best.dqn.batch_size) == (256, 512)
+    assert (default.dqn.replay_ratio, best.dqn.replay_ratio) == (32, 64)
+    assert (default.dqn.min_replay_size, best.dqn.min_replay_size) == (1_024, 2_048)
+    assert (default.dqn.epsilon_decay_steps, best.dqn.epsilon_decay_steps) == (5_000, 10_000)
+    assert (default.num_env_steps, best.num_env_steps) == (40_000, 200_000)
     random = best.randomization
     assert (random.gyro_noise, random.accel_noise) == (0.002, 0.023)
     assert (random.payload, random.latency_share) == (5.0, 0.15)
