@@ -132,14 +132,14 @@ class Learner:
 
     def init(self, seed: int) -> TrainState:
         """Builds the state of a new run, or of runs `seed`, `seed + 1`, ..., on its devices."""
-        keys = jax.vmap(jax.random.PRNGKey)(seed + jnp.arange(self.num_seeds))
-        return self._init_program(keys if self.num_seeds > 1 else keys[0])
+        seeds = np.arange(seed, seed + self.num_seeds, dtype=np.int32)
+        return self._init_program(seeds if self.num_seeds > 1 else seeds[0])
 
     @cached_property
-    def _init_program(self) -> Callable[[jax.Array], TrainState]:
+    def _init_program(self) -> Callable[[np.ndarray], TrainState]:
         return jax.jit(
             jax.shard_map(
-                self._each_seed(self.initial),
+                self._each_seed(lambda seed: self.initial(jax.random.PRNGKey(seed))),
                 mesh=self.mesh,
                 in_specs=REPLICATED,
                 out_specs=self.specs,
