@@ -184,7 +184,7 @@ class Learner:
 
     def exported(self, state: TrainState) -> Params:
         """The parameters of one run (no seed axis) for a network that takes raw observations."""
-        return self._folded(state.params, state.inputs)
+        return jax.jit(self._folded)(state.params, state.inputs)
 
     def _folded(self, params: Params, inputs: InputStatistics) -> Params:
         """Folds the whitening in: the small kernel instead of every observation."""
