@@ -107,8 +107,8 @@ def test_the_learner_is_the_configs(
     assert learner.action_factors == (21, 21)
     assert learner.symmetries is not None
     assert learner.first_reset == env.reset_staggered
-    # 10 decisions of 32 envs, each transition replayed 512 times in batches of 512.
-    assert lengths == [320]
+    # 10 decisions of 32 envs, each transition replayed 512 times in batches of 256.
+    assert lengths == [640]
 
 
 MIB = 2**20
