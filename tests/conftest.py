@@ -17,6 +17,8 @@ from mjx_balance.robots.quadruped import QUADRUPED
 from mjx_balance.scene import Scene, load_scene
 
 jax.config.update("jax_num_cpu_devices", 2)
+# The suite compiles longer than it computes. XLA reads this when its first device is asked for.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
 
 
 FLEET = (
