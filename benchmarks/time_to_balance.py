@@ -27,6 +27,7 @@ from rich.console import Console
 from throughput import hardware
 
 from mjx_balance import evaluation
+from mjx_balance.config import preset
 from mjx_balance.display import Display
 from mjx_balance.policy import load_policy
 from mjx_balance.run_folder import RunFolder, write_json
@@ -34,7 +35,7 @@ from mjx_balance.suites import HEADLINE, SEEDS
 
 HERE = Path(__file__).resolve().parent
 ENGINES = ("mujoco", "mjx")
-PRESET = "quick"
+PRESET = preset("quick")
 PEER = "sb3"
 SCENARIOS, DURATION = 64, 60.0
 POLL = 0.02
@@ -60,7 +61,7 @@ def ours(engine: str, decisions: int, work: Path, display: Display) -> Iterator[
     for start in ("cold", "warm"):
         display.say(f"{engine}, {start}:")
         folder = RunFolder(work / f"{engine}-{start}")
-        flags = f"--preset {PRESET} --engine {engine} --num-env-steps {decisions}".split()
+        flags = f"--preset {PRESET.preset} --engine {engine} --num-env-steps {decisions}".split()
         flags += ["--run-dir", str(folder.path)]
         command = [sys.executable, str(HERE.parent / "train.py"), *flags]
         seconds = time_to_file(command, folder.policy, work / f"cache-{engine}")
@@ -190,7 +191,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
     names = (*ENGINES, PEER)
     parser.add_argument("--contenders", nargs="+", default=names, choices=names)
-    parser.add_argument("--decisions", type=int, default=8_192, help="of our trainings")
+    wanted = PRESET.num_env_steps
+    parser.add_argument("--decisions", type=int, default=wanted, help="of our trainings")
     parser.add_argument("--threshold", type=float, default=0.20, help=f"that {PEER} reaches, deg")
     parser.add_argument("--most", type=int, default=200_000, help=f"decisions of {PEER} at most")
     parser.add_argument("--every", type=int, default=5_000, help="decisions between checkpoints")

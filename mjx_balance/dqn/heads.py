@@ -6,6 +6,7 @@ the value of one action and the best action without valuing all of them.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -24,11 +25,11 @@ class Added:
 
     def every(self) -> Any:
         """Values of all actions, (..., prod(factors))."""
-        first, *others = self._split()
+        values, *others = self._split()
         for branch in others:
-            first = first[..., :, None] + branch[..., None, :]
-            first = first.reshape(*first.shape[:-2], math.prod(first.shape[-2:]))
-        return first
+            values = values[..., :, None] + branch[..., None, :]
+            values = values.reshape(*values.shape[:-2], math.prod(values.shape[-2:]))
+        return values
 
     def of(self, action: Any) -> Any:
         """Values (...) of action indices (...)."""
@@ -91,7 +92,8 @@ class Radial:
 Head = Added | Radial
 
 
-def points(factors: Sequence[int]) -> np.ndarray:
+@functools.cache
+def points(factors: tuple[int, ...]) -> np.ndarray:
     """Where the radial head places the actions: (prod(factors), len(factors)), -1 to 1."""
     axes = [np.linspace(-1, 1, levels) for levels in factors]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

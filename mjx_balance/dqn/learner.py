@@ -155,8 +155,8 @@ class Learner:
             in them, with a leading seed axis if there are several seeds; NaN if nothing did,
             as for the loss of a call without an update.
 
-        Wait for a call before the next but a few: XLA holds back a CPU device's launch while 32
-        are on their way, and the other devices wait for it for ever.
+        Wait for a result every few calls: of CPU devices XLA starts no more than 32 launches at
+        once, and those started would wait for ever for the one that was not.
         """
         iteration = self._each_seed(self.iteration, in_axes=(0, None))
 
