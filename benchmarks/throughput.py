@@ -34,7 +34,7 @@ def measure(engine: Any, num_envs: int, preset_name: str, rounds: int) -> dict[s
     """Measures one row in this process."""
     from mjx_balance.quiet import quiet_imports
 
-    with quiet_imports():
+    with quiet_imports("torch", *(["warp"] if engine != "warp" else [])):
         import jax
 
         from mjx_balance.env import BalanceEnv

@@ -17,7 +17,7 @@ __all__ = ["BalanceEnv", "load_policy"]
 
 def __getattr__(name: str) -> object:
     if name == "BalanceEnv":
-        with quiet_imports():
+        with quiet_imports("torch"):
             from mjx_balance.env import BalanceEnv
 
         return BalanceEnv

@@ -96,7 +96,8 @@ def _train(argv: list[str]) -> int:
     if parsed.resume and parsed.run_dir:
         return _complain("--resume continues a folder in place; leave --run-dir out")
 
-    with quiet_imports():
+    engine = parsed.config.engine
+    with quiet_imports("torch", *(["warp"] if engine != "warp" else [])):
         from mjx_balance.training import run
     from mjx_balance.display import Display
     from mjx_balance.training.checkpoints import CheckpointError

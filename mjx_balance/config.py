@@ -251,13 +251,14 @@ class Config:
     """Scenarios per suite of the evaluation after training."""
     eval_duration: float = bounded(60.0, above=0)
     """Length of each of them, s."""
-    engine: Literal["mjx", "mujoco"] = "mjx"
-    """Physics of the training: MJX, on any device, or MuJoCo's C engine, on CPUs."""
+    engine: Literal["mjx", "mujoco", "warp"] = "mjx"
+    """Physics of the training: MJX, on any device; MuJoCo's C engine, on CPUs; or MJX-Warp, on
+    NVIDIA GPUs, whose steps do not repeat bit for bit."""
     robot: str = "quadruped"
     """The robot (robots/)."""
     solver_iterations: int = bounded(4, least=1, most=1_000)
-    """Newton iterations of a physics step of engine `mjx`; `mujoco` goes on until it has
-    converged. A batch waits for its slowest env, but fewer do not converge when a random policy
+    """Newton iterations of a physics step of engines `mjx` and `warp`; `mujoco` goes on until it
+    has converged. A batch waits for its slowest env, but fewer do not converge when a random policy
     lifts a foot: with one, robots jump (benchmarks/README.md)."""
     line_search_iterations: int = bounded(6, least=1, most=1_000)
     """Line-search iterations of each of them."""

@@ -27,6 +27,7 @@ FLOORS = (
     ("model_fields", "dqn.learner"),
     ("engines", "engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
     ("engines.mjx", "engines.compiled", "evaluation"),
+    ("engines.warp",),
     ("engines.choice",),
     ("env",),
     ("render", "display", "report"),

@@ -13,7 +13,7 @@ def test_pytorch_is_not_there_while_others_are_imported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delitem(sys.modules, "torch", raising=False)
-    with quiet_imports():
+    with quiet_imports("torch"):
         print("Failed to import warp")
         with pytest.raises(ImportError):
             importlib.import_module("torch")
@@ -24,6 +24,6 @@ def test_pytorch_is_not_there_while_others_are_imported(
 def test_pytorch_that_is_in_use_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     used = types.ModuleType("torch")
     monkeypatch.setitem(sys.modules, "torch", used)
-    with quiet_imports():
+    with quiet_imports("torch"):
         assert importlib.import_module("torch") is used
     assert sys.modules["torch"] is used

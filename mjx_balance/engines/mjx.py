@@ -4,6 +4,7 @@ import copy
 import functools
 
 import jax
+import mujoco
 from mujoco import mjx
 
 from mjx_balance.engines.engine import Engine, Motion, PhysicsState
@@ -13,16 +14,22 @@ from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.randomization import Conditions
 
 
+def trained_model(scene: Scene) -> mujoco.MjModel:
+    """The scene's model with the solver of its config."""
+    model = copy.copy(scene.model)
+    model.opt.iterations = scene.config.solver_iterations
+    model.opt.ls_iterations = scene.config.line_search_iterations
+    # Rows that MJX would solve at every step, and that never push: heights are clipped.
+    model.jnt_limited[:] = False
+    return model
+
+
 def mjx_engine(scene: Scene) -> Engine:
     """Solves as the scene's config says; the model is put on the device when it is first traced."""
 
     @functools.cache
     def on_device() -> tuple[mjx.Model, mjx.Data]:
-        model = copy.copy(scene.model)
-        model.opt.iterations = scene.config.solver_iterations
-        model.opt.ls_iterations = scene.config.line_search_iterations
-        # Rows that MJX would solve at every step, and that never push: heights are clipped.
-        model.jnt_limited[:] = False
+        model = trained_model(scene)
         with jax.ensure_compile_time_eval():  # constants, though this runs inside a trace
             return mjx.put_model(model), mjx.make_data(model)
 

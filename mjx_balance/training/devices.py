@@ -44,6 +44,11 @@ def size_to_device(config: Config) -> Config:
             f"engine is mujoco, which runs on CPUs, and JAX uses {available[0].device_kind}; set "
             "JAX_PLATFORMS=cpu, or choose engine mjx"
         )
+    if config.engine == "warp" and available[0].platform not in ("cpu", "gpu", "cuda"):
+        raise ConfigError(
+            f"engine is warp, which runs on NVIDIA GPUs and CPUs, and JAX uses "
+            f"{available[0].device_kind}; choose engine mjx"
+        )
     num_envs, batch_size = config.num_envs, config.dqn.batch_size
     if num_envs is None:
         num_envs = CPU_ENVS if on_cpu else ACCELERATOR_ENVS

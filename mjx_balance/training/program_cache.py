@@ -126,7 +126,7 @@ def compiler_options() -> dict[str, str | bool]:
 
 
 def compile_program(
-    program: Callable[[Any], tuple[Any, Any]], state: Any, key: str, say: Say
+    program: Callable[[Any], tuple[Any, Any]], state: Any, key: str | None, say: Say
 ) -> Callable[[Any], tuple[Any, Any]]:
     """Compiles a jitted `state -> (state, output)`, from the cache where it can.
 
@@ -134,25 +134,21 @@ def compile_program(
       program: jitted; traced only if the cache does not know `key`. The state it
         returns has the structure of its argument, whose buffers are donated.
       state: an example, on its devices.
-      key: from `program_key`.
+      key: from `program_key`; none for a program that calls what only this process knows, and
+        that can therefore not be kept.
       say: told what is wrong with the cache.
 
     Returns:
       The compiled program.
     """
     leaves, structure = jax.tree.flatten(state)
-    path = cache_dir() / "programs" / f"{key}.stablehlo"
 
     def flat(leaves: list[jax.Array]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
         state, output = program(jax.tree.unflatten(structure, leaves))
         return jax.tree.leaves(state), output
 
-    exported = _load(path, say)
-    if exported is None:
-        ours = [export.DisabledSafetyCheck.custom_call(name) for name in ffi.registered()]
-        exported = export.export(jax.jit(flat, donate_argnums=0), disabled_checks=ours)(leaves)
-        _store(path, exported, say)
-    lowered = jax.jit(exported.call, donate_argnums=0).lower(leaves)
+    traced = flat if key is None else _kept(flat, leaves, key, say)
+    lowered = jax.jit(traced, donate_argnums=0).lower(leaves)
     compiled = lowered.compile(compiler_options())
 
     def run(state: Any) -> tuple[Any, Any]:
@@ -160,6 +156,19 @@ def compile_program(
         return jax.tree.unflatten(structure, leaves), output
 
     return run
+
+
+def _kept(
+    flat: Callable[..., Any], leaves: list[jax.Array], key: str, say: Say
+) -> Callable[..., Any]:
+    """The traced program of that key, from its file or made and stored now."""
+    path = cache_dir() / "programs" / f"{key}.stablehlo"
+    exported = _load(path, say)
+    if exported is None:
+        ours = [export.DisabledSafetyCheck.custom_call(name) for name in ffi.registered()]
+        exported = export.export(jax.jit(flat, donate_argnums=0), disabled_checks=ours)(leaves)
+        _store(path, exported, say)
+    return exported.call
 
 
 def _load(path: Path, say: Say) -> export.Exported | None:

@@ -133,6 +133,7 @@ def _learn(
             display.say(f"resuming at {loop.number(state.env_steps):,} decisions")
         if loop.number(state.env_steps) < plan.total:
             key = program_cache.program_key(config, plan.iterations, devices.__name__)
+            key = None if config.engine == "warp" else key  # its kernels live in this process
             program = stop.run(program_cache.compile_program, program, state, key, display.say)
     return loop.learn(plan, program, state, folder, display, stop, validate)
 

@@ -45,6 +45,14 @@ def test_the_c_engine_is_refused_where_jax_has_no_cpu(monkeypatch: pytest.Monkey
         size_to_device(dataclasses.replace(CONFIG, engine="mujoco"))
 
 
+def test_warp_is_refused_where_it_has_no_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    tpu = types.SimpleNamespace(platform="tpu", device_kind="TPU v6e")
+    monkeypatch.setattr(jax, "devices", lambda: [tpu])
+    said = "engine is warp, which runs on NVIDIA GPUs and CPUs, and JAX uses TPU v6e; choose"
+    with pytest.raises(ConfigError, match=said):
+        size_to_device(dataclasses.replace(CONFIG, engine="warp"))
+
+
 @pytest.mark.parametrize(
     ("num_envs", "batch_size", "available", "expected"),
     [(64, 512, 8, 8), (60, 512, 8, 4), (64, 510, 8, 2), (63, 512, 8, 1), (6, 9, 4, 3)],

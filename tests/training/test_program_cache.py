@@ -75,6 +75,14 @@ def test_a_second_start_traces_nothing(cache: Path) -> None:
     assert second.traced == 1
 
 
+def test_a_program_without_a_key_is_traced_every_time(cache: Path) -> None:
+    """As one that calls what another process would not know."""
+    for counter in (Counter(), Counter()):
+        check_run(compile_program(counter.program, start(), None, pytest.fail))
+        assert counter.traced == 1
+    assert not (cache / "programs").exists()
+
+
 @pytest.mark.parametrize(
     "damage",
     [
