@@ -210,6 +210,9 @@ class DQNConfig:
     """Learn from reflections of the transitions too (task/symmetry.py; paper: none)."""
     double: bool = False
     """Double DQN (van Hasselt et al. 2015) instead of Eq. 1's max over the target network."""
+    huber_delta: float | None = bounded(None, above=0)
+    """TD error from which on the loss grows linearly (Mnih et al. 2015); none: it is squared
+    throughout (chosen)."""
     max_grad_norm: float = bounded(10.0, above=0)
     """Global-norm gradient clipping (chosen)."""
 

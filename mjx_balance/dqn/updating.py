@@ -78,7 +78,7 @@ def mirrored(symmetries: Symmetries, batch: Transition, key: jax.Array) -> Trans
 def loss(
     params: Params, target_params: Params, batch: Transition, q_values: QValues, config: DQNConfig
 ) -> jax.Array:
-    """Mean squared TD error () of a batch.
+    """Mean squared TD error () of a batch; of errors beyond `huber_delta`, its tangent there.
 
     The error is r + discount * max_a q'(s', a) - q(s, a), where q' is the target network and
     the discount is 0 after a termination (paper Eq. 1). With `double` the online network
@@ -90,7 +90,10 @@ def loss(
     selector = q_values(params, batch.next_obs) if config.double else target
     q_t = target.of(selector.greedy())
     discount_t = config.gamma * (1 - batch.terminated)
-    return jnp.mean((batch.reward + discount_t * q_t - q_tm1) ** 2)
+    error = batch.reward + discount_t * q_t - q_tm1
+    if config.huber_delta is None:
+        return jnp.mean(error**2)
+    return 2 * jnp.mean(optax.losses.huber_loss(error, delta=config.huber_delta))
 
 
 def update(

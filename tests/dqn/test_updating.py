@@ -123,6 +123,17 @@ def test_loss_by_hand(double: bool, terminated: float, error: float) -> None:
     np.testing.assert_allclose(by_target, wanted, atol=1e-6)
 
 
+def test_a_loss_is_linear_in_errors_beyond_delta() -> None:
+    """Errors 0.3, 2 and -5: below delta squared; beyond, the tangent 2 delta |e| - delta^2."""
+    zeros = jnp.zeros(3)
+    batch = Transition(zeros, zeros.astype(int), jnp.asarray([0.3, 2, -5]), zeros, zeros)
+    config = DQNConfig(gamma=0, huber_delta=0.5)
+    q_values = lambda value, obs: Added(jnp.broadcast_to(value, (3, 1)), (1,))  # noqa: E731
+    got, slope = jax.value_and_grad(loss)(jnp.zeros(()), jnp.zeros(()), batch, q_values, config)
+    assert float(got) == pytest.approx((0.09 + 1.75 + 4.75) / 3)
+    assert float(slope) == pytest.approx((-2 * 0.3 - 2 * 0.5 + 2 * 0.5) / 3)
+
+
 def test_loss_is_the_mean_over_the_batch() -> None:
     rng = np.random.default_rng(0)
     q_tm1, q_t = rng.normal(size=(2, 5, 3))
