@@ -30,6 +30,15 @@ class TrainArgs:
     """Folder to create for the run; none: runs/PRESET-SEED-TIME."""
     resume: Path | None = None
     """Run folder to continue instead."""
+    distributed: bool = False
+    """Be one of several processes, on one machine or many, that Slurm, Open MPI or Kubernetes has
+    started; or one that the next three flags place. All get the same other flags."""
+    coordinator: str | None = None
+    """HOST:PORT at which process 0 listens, where no cluster says so."""
+    process_id: int | None = None
+    """Number of this process, from 0."""
+    num_processes: int | None = None
+    """How many there are."""
     config: tyro.conf.OmitArgPrefixes[Config] = dataclasses.field(default_factory=Config)
 
 
@@ -98,15 +107,24 @@ def _train(argv: list[str]) -> int:
 
     engine = parsed.config.engine
     with quiet_imports("torch", *(["warp"] if engine != "warp" else [])):
-        from mjx_balance.training import run
+        from mjx_balance.training import processes, run
     from mjx_balance.display import Display
     from mjx_balance.training.checkpoints import CheckpointError
 
     display = Display()
     try:
-        run.train(parsed.config, parsed.run_dir, parsed.resume, display)
-    except (ConfigError, RunFolderError, CheckpointError) as error:
+        place = None
+        where = (parsed.coordinator, parsed.process_id, parsed.num_processes)
+        if parsed.distributed or where != (None, None, None):
+            place = processes.find_place(*where)
+            if place.index:
+                display = Display(Console(quiet=True))
+        run.train(parsed.config, parsed.run_dir, parsed.resume, display, place)
+    except (ConfigError, RunFolderError, CheckpointError, processes.ProcessError) as error:
         return _complain(str(error))
+    except processes.ProcessLostError as error:
+        _complain(str(error))
+        return FAILED
     except PolicyError as error:
         _complain(str(error))
         return FAILED

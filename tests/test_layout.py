@@ -35,6 +35,7 @@ FLOORS = (
     ("report.reading",),
     ("report.measuring",),
     ("report.page",),
+    ("training.processes",),
     ("training.checkpoints", "training.program_cache"),
     ("training.devices", "training.loop"),
     ("training.validation",),

@@ -26,9 +26,10 @@ VARIED = ("payload", "payload_at", "friction", "gain")
 def mujoco_engine(scene: Scene) -> Engine:
     """Registers the engine with XLA.
 
-    Every device has threads of its own: as many as there are cores for each.
+    Every device has threads of its own: as many as this process has cores for each of its own.
     """
-    threads = max(1, cores() // (scene.config.num_devices or 1))
+    devices = scene.config.num_devices
+    threads = max(1, cores() // max(1, devices // jax.process_count())) if devices else cores()
     # The name stands for all that a call's results depend on: a program that was traced in another
     # process finds its engine by it.
     name = f"mjx_balance.{scene.hash}"

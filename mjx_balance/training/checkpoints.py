@@ -13,6 +13,8 @@ from typing import TypeVar, cast
 
 import orbax.checkpoint as ocp
 
+from mjx_balance.training.processes import ALONE, Processes, ProcessLostError
+
 T = TypeVar("T")
 
 KEPT = 2
@@ -23,36 +25,52 @@ class CheckpointError(ValueError):
     """Checkpoints that cannot be written, or of which none is whole; the message says where."""
 
 
-def save(directory: Path, env_steps: int, state: object) -> None:
+def save(directory: Path, env_steps: int, state: object, processes: Processes = ALONE) -> None:
     """Writes a checkpoint; does nothing if it is already there.
+
+    Every process writes its own part of the state; the first one does the rest.
 
     Args:
       directory: of all checkpoints of a run.
       env_steps: decisions so far.
       state: a pytree of arrays.
+      processes: that share the state.
 
     Raises:
       CheckpointError: if it cannot be written; those before it stay.
     """
     path = directory / str(env_steps)
-    if path.exists():
-        return
     part = path.with_suffix(".part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
+
+    def begin() -> bool:
+        if path.exists():
+            return False
+        shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
-        with _checkpointer() as checkpointer:
-            checkpointer.save((part / "state").resolve(), state)
+        return True
+
+    def end() -> None:
         (part / "sum").write_text(_sum(part / "state"))
         part.rename(path)
+        for stale in saved_steps(directory)[:-KEPT]:
+            shutil.rmtree(directory / str(stale))
+
+    try:
+        if not processes.from_first(begin):
+            return
+        with _checkpointer() as checkpointer:
+            checkpointer.save((part / "state").resolve(), state)
+        processes.from_first(end)
+    except ProcessLostError:
+        raise
     except Exception as error:  # whatever orbax raises on a full disk, say
         said = " ".join(str(error).split())[:300]
         raise CheckpointError(f"the checkpoint {path} cannot be written: {said}") from error
-    for stale in saved_steps(directory)[:-KEPT]:
-        shutil.rmtree(directory / str(stale))
 
 
-def restore(directory: Path, like: T, say: Callable[[str], None]) -> T | None:
+def restore(
+    directory: Path, like: T, say: Callable[[str], None], processes: Processes = ALONE
+) -> T | None:
     """Reads the newest checkpoint that is whole.
 
     Args:
@@ -60,6 +78,7 @@ def restore(directory: Path, like: T, say: Callable[[str], None]) -> T | None:
       like: a state with the structure, shapes, dtypes and shardings wanted.
       say: told of every damaged one; once a whole one is found, they are removed, as the
         run will come by there again.
+      processes: that share the state, as many as they now are.
 
     Returns:
       The state, or none if none was ever saved.
@@ -67,12 +86,13 @@ def restore(directory: Path, like: T, say: Callable[[str], None]) -> T | None:
     Raises:
       CheckpointError: if there are checkpoints, but none is whole.
     """
-    steps = saved_steps(directory)
+    steps = processes.from_first(lambda: saved_steps(directory))
     for k, step in reversed(list(enumerate(steps))):
         path = directory / str(step)
-        state = _read(path, like)
-        if state is not None:
-            for damaged in steps[k + 1 :]:
+        whole = processes.from_first(lambda path=path: _is_whole(path))
+        state = _read(path, like) if whole else None
+        if all(processes.gather(state is not None)):
+            for damaged in steps[k + 1 :] if processes.first else ():
                 shutil.rmtree(directory / str(damaged))
             return state
         say(f"the checkpoint {path} is damaged" + ("; trying the one before" if k else ""))
@@ -89,11 +109,17 @@ def saved_steps(directory: Path) -> list[int]:
     return sorted(int(name) for name in names if name.isascii() and name.isdigit())
 
 
-def _read(path: Path, like: T) -> T | None:
-    """One checkpoint, or none if it is damaged or of another structure."""
+def _is_whole(path: Path) -> bool:
+    """Whether a checkpoint's files have the sum that they were written with."""
     try:
-        if (path / "sum").read_bytes() != _sum(path / "state").encode():
-            return None
+        return (path / "sum").read_bytes() == _sum(path / "state").encode()
+    except OSError:
+        return False
+
+
+def _read(path: Path, like: T) -> T | None:
+    """One checkpoint, or none if it is of another structure."""
+    try:
         with _checkpointer() as checkpointer:
             return cast(T, checkpointer.restore((path / "state").resolve(), like))
     except Exception:  # whatever orbax and its file formats raise

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-import os
+from typing import Any
 
 import jax
 import psutil
@@ -11,6 +11,7 @@ import psutil
 from mjx_balance.config import Config, ConfigError, check
 from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.engines.mujoco import cores
 from mjx_balance.env import BalanceEnv
 from mjx_balance.policy import network_branches
 from mjx_balance.training.program_cache import Say, enable_compilation_cache
@@ -24,10 +25,10 @@ ACCELERATOR_ENVS = 2048
 
 
 def configure_jax(say: Say) -> None:
-    """Makes every CPU core a JAX device and turns the compilation cache on."""
+    """Makes every CPU core of this process a JAX device and turns the compilation cache on."""
     # Too late if JAX is already in use, as in a notebook: its devices do as they are.
     with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+        jax.config.update("jax_num_cpu_devices", cores())
     enable_compilation_cache(say)
 
 
@@ -52,12 +53,16 @@ def size_to_device(config: Config) -> Config:
     num_envs, batch_size = config.num_envs, config.dqn.batch_size
     if num_envs is None:
         num_envs = CPU_ENVS if on_cpu else ACCELERATOR_ENVS
-    num_devices = config.num_devices
+    num_devices, processes = config.num_devices, jax.process_count()
     if num_devices is None:
-        num_devices = _even_share(len(available), num_envs, batch_size)
+        num_devices = _even_share(len(available), processes, num_envs, batch_size)
     elif num_devices > len(available):
         raise ConfigError(
             f"num_devices is {num_devices}; this machine has {len(available)} JAX devices"
+        )
+    if num_devices % processes:
+        raise ConfigError(
+            f"num_devices is {num_devices}; it must be a multiple of num_processes, {processes}"
         )
     for name, value in (("num_envs", num_envs), ("batch_size", batch_size)):
         if value % num_devices:
@@ -68,9 +73,27 @@ def size_to_device(config: Config) -> Config:
     return check(sized)
 
 
-def _even_share(available: int, *counts: int) -> int:
-    """As many devices as share each of the counts out evenly."""
-    return next(n for n in range(available, 0, -1) if not any(count % n for count in counts))
+def _even_share(available: int, processes: int, *counts: int) -> int:
+    """As many devices as share each of the counts out evenly, the same number in each process."""
+    possible = range(available - available % processes, processes, -processes)
+    return next((n for n in possible if not any(count % n for count in counts)), processes)
+
+
+def used_devices(num_devices: int) -> list[Any]:
+    """The devices of a run's mesh, the same number of every process, in their order.
+
+    Raises:
+      ConfigError: if one has fewer.
+    """
+    each, found = num_devices // jax.process_count(), []
+    for k in range(jax.process_count()):
+        own = jax.local_devices(process_index=k)
+        if len(own) < each:
+            raise ConfigError(
+                f"num_devices is {num_devices}, {each} per process; process {k} has {len(own)}"
+            )
+        found += own[:each]
+    return found
 
 
 def make_learner(config: Config, env: BalanceEnv) -> Learner:
@@ -83,7 +106,7 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
         config.dqn,
         config.num_envs,
         config.num_env_steps,
-        jax.devices()[: config.num_devices],
+        used_devices(config.num_devices),
         config.num_seeds,
         env.symmetries,
         env.action_factors,

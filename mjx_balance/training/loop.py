@@ -8,8 +8,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -21,6 +22,7 @@ from mjx_balance.display import Display
 from mjx_balance.dqn.learner import TrainState
 from mjx_balance.run_folder import RunFolder, keep_metrics_until, keep_validated_until
 from mjx_balance.training import checkpoints
+from mjx_balance.training.processes import ALONE, Processes
 
 T = TypeVar("T")
 
@@ -31,6 +33,8 @@ ANSWER_S = 0.2
 
 Program = Callable[[TrainState], tuple[TrainState, Mapping[str, jax.Array]]]
 """A compiled call: many decisions of every env, and the means of what was measured."""
+Write = Callable[[TrainState, dict[str, float], dict[str, Any]], None]
+"""Takes what a call measured: over all seeds, and of each."""
 Validate = Callable[[TrainState], Mapping[str, np.ndarray]]
 """Tries the greedy policies of a state; what came of it by logged names, one value per seed."""
 
@@ -158,6 +162,7 @@ def learn(
     display: Display,
     stop: Interrupts,
     validate: Validate,
+    processes: Processes = ALONE,
 ) -> tuple[TrainState, float]:
     """Calls the program until the last decision or until the user stops; saves either way.
 
@@ -165,33 +170,52 @@ def learn(
     and before a checkpoint, so that a run that is resumed has neither missed it nor logs it
     twice. What the folder has logged or validated after the state's decisions is dropped first.
 
+    Of several processes all call the program and save; the first one logs, shows and validates.
+    They stop together, whichever of them is told to.
+
     Returns:
       The last state, and the seconds spent learning by this call, validations apart.
     """
     done = number(state.env_steps)
-    keep_metrics_until(folder.metrics, done)
-    keep_validated_until(folder.validated, done)
     seconds = validating = 0.0
     saved_at = time.monotonic()
-    with (
-        folder.metrics.open("a") as log,
-        _board(folder, done) as board,
-        display.training(done, plan.total),
-    ):
-        while done < plan.total and not stop:
+    with _journal(plan, folder, display, done) if processes.first else nullcontext() as write:
+        while done < plan.total and not processes.any(bool(stop)):
             before, began = done, time.perf_counter()
             state, raw = stop.run(_finished, program, state)
             elapsed = time.perf_counter() - began
             seconds += elapsed
             done = number(state.env_steps)
-            metrics, seeds = measured(raw, elapsed, plan)
-            if validation_due(plan, before, done):
-                began = time.perf_counter()
-                held_out = stop.run(validate, state)
-                validating += time.perf_counter() - began
-                metrics |= means(held_out)
-                metrics["perf/validation_share"] = validating / (seconds + validating)
-                seeds |= listed(held_out)
+            if write is not None:
+                metrics, seeds = measured(raw, elapsed, plan)
+                if validation_due(plan, before, done):
+                    began = time.perf_counter()
+                    held_out = stop.run(validate, state)
+                    validating += time.perf_counter() - began
+                    metrics |= means(held_out)
+                    metrics["perf/validation_share"] = validating / (seconds + validating)
+                    seeds |= listed(held_out)
+                write(state, metrics, seeds)
+            if processes.any(time.monotonic() - saved_at >= plan.checkpoint_seconds):
+                checkpoints.save(folder.checkpoints, done, state, processes)
+                saved_at = time.monotonic()
+    checkpoints.save(folder.checkpoints, done, state, processes)
+    return state, seconds
+
+
+@contextmanager
+def _journal(plan: Plan, folder: RunFolder, display: Display, done: int) -> Iterator[Write]:
+    """Writes what a call measured into the folder, and shows it."""
+    keep_metrics_until(folder.metrics, done)
+    keep_validated_until(folder.validated, done)
+    with (
+        folder.metrics.open("a") as log,
+        _board(folder, done) as board,
+        display.training(done, plan.total),
+    ):
+
+        def write(state: TrainState, metrics: dict[str, float], seeds: dict[str, Any]) -> None:
+            done = number(state.env_steps)
             line: dict[str, Any] = {"env_steps": done}
             line |= {"gradient_steps": number(state.gradient_steps)} | metrics
             if plan.num_seeds > 1:
@@ -201,11 +225,8 @@ def learn(
             for name, value in metrics.items():
                 board.add_scalar(name, value, done)
             display.update(done, metrics)
-            if time.monotonic() - saved_at >= plan.checkpoint_seconds:
-                checkpoints.save(folder.checkpoints, done, state)
-                saved_at = time.monotonic()
-    checkpoints.save(folder.checkpoints, done, state)
-    return state, seconds
+
+        yield write
 
 
 def validation_due(plan: Plan, before: int, done: int) -> bool:

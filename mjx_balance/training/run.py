@@ -9,12 +9,14 @@ from typing import Any
 
 import jax
 
-from mjx_balance.config import Config, check
+from mjx_balance.config import Config, ConfigError, check, flatten, to_dict
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.env import BalanceEnv
+from mjx_balance.policy import Policy, PolicyError
 from mjx_balance.run_folder import (
     RunFolder,
+    RunFolderError,
     check_same_config,
     check_same_provenance,
     create_run_folder,
@@ -22,6 +24,8 @@ from mjx_balance.run_folder import (
     read_run_config,
 )
 from mjx_balance.training import checkpoints, devices, finish, loop, program_cache, validation
+from mjx_balance.training.checkpoints import CheckpointError
+from mjx_balance.training.processes import ALONE, Place, Processes, joined
 from mjx_balance.training.program_cache import Say
 
 
@@ -29,9 +33,17 @@ class Interrupted(Exception):
     """The user stopped the run; the message says what is saved and how to go on."""
 
 
+ORDERLY = (ConfigError, RunFolderError, CheckpointError, PolicyError, Interrupted)
+"""How all processes of a run end together, besides its end."""
+
+
 def train(
-    config: Config, run_dir: Path | None, resume: Path | None, display: Display
-) -> finish.Results:
+    config: Config,
+    run_dir: Path | None,
+    resume: Path | None,
+    display: Display,
+    place: Place | None = None,
+) -> finish.Results | None:
     """Runs or continues a training and everything that follows it.
 
     Args:
@@ -39,9 +51,11 @@ def train(
       run_dir: folder to create; one named after preset, seed and time if none.
       resume: folder to continue instead.
       display: shows progress.
+      place: of this process among several; the first one of them writes, shows and evaluates.
 
     Returns:
-      The evaluation, suite name -> JSON of `evaluation.summarize`.
+      The evaluation, suite name -> JSON of `evaluation.summarize`; none where another process
+      makes it.
 
     Raises:
       ConfigError: for an impossible config.
@@ -49,29 +63,44 @@ def train(
       RunFolderError: for a folder that cannot be used.
       CheckpointError: for a folder whose checkpoints are damaged.
       PolicyError: if no seed learnt a policy of finite numbers.
+      ProcessError: if the processes do not come together or do not fit together.
+      ProcessLostError: if another process has ended before its time.
       Interrupted: if the user stopped the run.
     """
     began = time.perf_counter()
-    devices.configure_jax(display.say)
-    config = devices.size_to_device(check(config))
-    finish.check_fits(config)
-    env = BalanceEnv(config)
-    learner = devices.make_learner(config, env)
-    devices.check_memory(learner)
-    folder = _open_folder(config, provenance(env), run_dir, resume, display.say)
-    with locked(folder), _resumable(folder):
-        with loop.Interrupts(display.say) as stop:
-            validate = functools.partial(validation.validate, config, learner, env.scene, folder)
-            state, seconds = _learn(config, learner, folder, display, stop, validate)
-            policies = finish.export(
-                config, learner, env.scene.hash, folder, state, seconds, display.say
-            )
-            if stop:
-                raise Interrupted(
-                    f"stopped at {loop.number(state.env_steps):,} decisions; the policy so far "
-                    f"is {folder.policy}; continue with --resume {folder.path}"
+    with joined(place, ORDERLY) as processes:
+        devices.configure_jax(display.say)
+        config = devices.size_to_device(check(config))
+        finish.check_fits(config)
+        env = BalanceEnv(config)
+        learner = devices.make_learner(config, env)
+        devices.check_memory(learner)
+        folder = _open_folder(config, provenance(env), run_dir, resume, display.say, processes)
+        with _locked(folder, processes), _resumable(folder):
+            with loop.Interrupts(display.say) as stop:
+                validate = functools.partial(
+                    validation.validate, config, learner, env.scene, folder
                 )
-        return finish.finish(config, policies, folder, display, began)
+                state, seconds = _learn(config, learner, folder, display, stop, validate, processes)
+                policies: list[Policy] = []
+
+                def export() -> None:
+                    policies.extend(
+                        finish.export(
+                            config, learner, env.scene.hash, folder, state, seconds, display.say
+                        )
+                    )
+
+                processes.from_first(export, PolicyError)
+                if processes.any(bool(stop)):
+                    raise Interrupted(
+                        f"stopped at {loop.number(state.env_steps):,} decisions; the policy so far "
+                        f"is {folder.policy}; continue with --resume {folder.path}"
+                    )
+            processes.part()  # what follows takes minutes of one process, and no device
+            if not processes.first:
+                return None
+            return finish.finish(config, policies, folder, display, began)
 
 
 def provenance(env: BalanceEnv) -> dict[str, Any]:
@@ -84,22 +113,41 @@ def provenance(env: BalanceEnv) -> dict[str, Any]:
 
 
 def _open_folder(
-    config: Config, today: Mapping[str, Any], run_dir: Path | None, resume: Path | None, say: Say
+    config: Config,
+    today: Mapping[str, Any],
+    run_dir: Path | None,
+    resume: Path | None,
+    say: Say,
+    processes: Processes,
 ) -> RunFolder:
     """The folder of a new run, or of the run to continue; says what will run where.
 
     Raises:
-      RunFolderError: if it cannot be used.
+      RunFolderError: if it cannot be used, or another process cannot see it.
+      ProcessError: if other processes were started with something else.
     """
-    if resume is None:
-        name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-        folder = create_run_folder(run_dir or Path("runs") / name, config, today)
-    else:
+    flags = flatten(to_dict(config)) | {"run_dir": str(run_dir), "resume": str(resume)}
+    processes.check_same(flags | dict(today))
+
+    def open_it() -> str:
+        if resume is None:
+            name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+            made = create_run_folder(run_dir or Path("runs") / name, config, today)
+            return str(made.path.absolute())
         check_same_config(read_run_config(resume), config, resume)
         warning = check_same_provenance(resume, today)
         if warning is not None:
             say(warning)
-        folder = RunFolder(resume)
+        return str(resume)
+
+    folder = RunFolder(Path(processes.from_first(open_it, RunFolderError)))
+    processes.folder = folder.path
+    seen = processes.gather(folder.config.is_file())
+    if not all(seen):
+        raise RunFolderError(
+            f"process {seen.index(False)} does not see {folder.path}; choose a folder that all "
+            "machines share with --run-dir"
+        )
     last = config.seed + config.num_seeds - 1
     seeds = f"seed {last}" if last == config.seed else f"seeds {config.seed} to {last}"
     say(
@@ -116,6 +164,7 @@ def _learn(
     display: Display,
     stop: loop.Interrupts,
     validate: loop.Validate,
+    processes: Processes = ALONE,
 ) -> tuple[TrainState, float]:
     """Goes on from the newest checkpoint, if there is one, to the last decision.
 
@@ -127,7 +176,7 @@ def _learn(
     compiling = display.phase("compiling (up to a minute the first time, seconds from then on)")
     with compiling, program_cache.mending_xla_cache(display.say):
         state = stop.run(learner.init, config.seed)
-        saved = checkpoints.restore(folder.checkpoints, state, display.say)
+        saved = checkpoints.restore(folder.checkpoints, state, display.say, processes)
         if saved is not None:
             state = saved
             display.say(f"resuming at {loop.number(state.env_steps):,} decisions")
@@ -135,7 +184,16 @@ def _learn(
             key = program_cache.program_key(config, plan.iterations, devices.__name__)
             key = None if config.engine == "warp" else key  # its kernels live in this process
             program = stop.run(program_cache.compile_program, program, state, key, display.say)
-    return loop.learn(plan, program, state, folder, display, stop, validate)
+    processes.gather(None)  # whoever compiles longest is awaited here, where nothing times out
+    return loop.learn(plan, program, state, folder, display, stop, validate, processes)
+
+
+@contextlib.contextmanager
+def _locked(folder: RunFolder, processes: Processes) -> Iterator[None]:
+    """The lock of a run's folder, held by the first of its processes."""
+    with contextlib.ExitStack() as stack:
+        processes.from_first(lambda: stack.enter_context(locked(folder)), RunFolderError)
+        yield
 
 
 @contextlib.contextmanager

@@ -217,9 +217,9 @@ def test_checkpoints_come_by_the_clock(
     saved: list[int] = []
     save = checkpoints.save
 
-    def remember(directory: Path, done: int, state: Any) -> None:
+    def remember(directory: Path, done: int, *state: Any) -> None:
         saved.append(done)
-        save(directory, done, state)
+        save(directory, done, *state)
 
     monkeypatch.setattr(checkpoints, "save", remember)
 

@@ -1,0 +1,146 @@
+"""Whole runs of two processes on one machine, over gloo, as on two machines of a cluster."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from mjx_balance import load_policy
+from mjx_balance.run_folder import RunFolder
+from mjx_balance.training.checkpoints import saved_steps
+
+REPO = Path(__file__).parents[2]
+FLAGS = (
+    "--preset smoke --engine mujoco --num-devices 2 --num-env-steps 4096 --eval-every 0 "
+    "--eval-scenarios 4 --eval-duration 5 --checkpoint-seconds 0.5"
+).split()
+PATIENCE_S = 300.0
+STARTED: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def nobody_is_left() -> Iterator[None]:
+    yield
+    for process in STARTED:
+        process.kill()
+
+
+def start(cache: Path, *flags: str) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, str(REPO / "train.py"), *flags],
+        env=os.environ | {"MJX_BALANCE_CACHE": str(cache)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    STARTED.append(process)
+    return process
+
+
+def start_two(cache: Path, *flags: str, seeds: tuple[int, int] = (0, 0)) -> list[subprocess.Popen]:
+    with socket.create_server(("", 0)) as server:
+        place = ["--coordinator", f"localhost:{server.getsockname()[1]}", "--num-processes", "2"]
+    return [
+        start(cache, *flags, *place, "--process-id", str(k), "--seed", str(seed))
+        for k, seed in enumerate(seeds)
+    ]
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Exit code and what was said, but for gloo's own line."""
+    said, _ = process.communicate(timeout=PATIENCE_S)
+    lines = [line for line in said.splitlines() if not line.startswith("[Gloo]")]
+    return process.returncode, "\n".join(lines)
+
+
+def wait(when: Callable[[], object]) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not when():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def alone(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """The run as one process with two devices makes it."""
+    folder = RunFolder(tmp_path_factory.mktemp("runs") / "alone")
+    code, said = end(start(cache, *FLAGS, "--run-dir", str(folder.path)))
+    assert code == 0, said
+    return folder
+
+
+def fingerprint(folder: RunFolder) -> str:
+    return load_policy(folder.policy).fingerprint
+
+
+def test_two_processes_make_the_run_of_one_with_two_devices(
+    alone: RunFolder, cache: Path, tmp_path: Path
+) -> None:
+    """To the bit: each steps its 32 boards, and the sums of two gradients are the same."""
+    folder = RunFolder(tmp_path / "run")
+    (code, said), (other_code, other_said) = map(
+        end, start_two(cache, *FLAGS, "--run-dir", str(folder.path))
+    )
+    assert (code, other_code) == (0, 0), said + other_said
+    assert "64 envs on 2 cpu device" in said
+    assert other_said == "", "one of them speaks"
+    assert fingerprint(folder) == fingerprint(alone)
+    assert len(folder.metrics.read_text().splitlines()) == 4
+    names = {path.name for path in alone.path.iterdir()}
+    assert {path.name for path in folder.path.iterdir()} == names
+
+
+def test_a_killed_and_a_stopped_process_lose_nothing(
+    alone: RunFolder, cache: Path, tmp_path: Path
+) -> None:
+    """Kill -9 of the second, SIGTERM to the second, then on in one process with two devices."""
+    folder = RunFolder(tmp_path / "run")
+    first, second = start_two(cache, *FLAGS, "--run-dir", str(folder.path))
+    wait(lambda: saved_steps(folder.checkpoints) or first.poll() is not None)
+    second.kill()
+    killed = time.monotonic()
+    code, said = end(first)
+    assert time.monotonic() - killed < 60
+    assert code == 1, said
+    sentence = "mjx-balance: process 1 is gone, and the run ends with it; continue with --resume"
+    assert f"{sentence} {folder.path}" in said
+    assert "Traceback" not in said
+    assert not folder.evaluation.exists()
+
+    saved = max(saved_steps(folder.checkpoints))
+    boards = len(list(folder.tensorboard.iterdir()))
+    first, second = start_two(cache, "--resume", str(folder.path))
+    wait(lambda: len(list(folder.tensorboard.iterdir())) > boards or first.poll() is not None)
+    second.send_signal(signal.SIGTERM)
+    (code, said), (other_code, other_said) = map(end, (first, second))
+    assert (code, other_code) == (130, 130), said + other_said
+    assert f"resuming at {saved:,} decisions" in said
+    assert f"continue with --resume {folder.path}" in said
+    stopped = load_policy(folder.policy).manifest["training"]["env_steps"]
+    assert saved <= stopped == max(saved_steps(folder.checkpoints))
+
+    code, said = end(start(cache, "--resume", str(folder.path)))
+    assert code == 0, said
+    assert fingerprint(folder) == fingerprint(alone)
+
+
+def test_processes_that_were_started_differently_all_say_so(cache: Path, tmp_path: Path) -> None:
+    flags = (*FLAGS, "--run-dir", str(tmp_path / "run"))
+    for code, said in map(end, start_two(cache, *flags, seeds=(3, 4))):
+        assert code == 2, said
+        assert said == (
+            "mjx-balance: process 1 has seed = 4, process 0 has 3; start all with the same flags "
+            "and the same installation"
+        )
+    assert not (tmp_path / "run").exists()
