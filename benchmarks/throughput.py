@@ -51,8 +51,8 @@ def measure(engine: Any, num_envs: int, preset_name: str, rounds: int) -> dict[s
     decisions = iterations * num_envs
 
     state = learner.init(0)
-    raw, raw_compile = _compiled(_random_program(learner, iterations), state.env_state)
-    train, train_compile = _compiled(learner.train_program(iterations), state)
+    raw, raw_compile = compiled(env_program(learner, iterations), state.env_state)
+    train, train_compile = compiled(learner.train_program(iterations), state)
     env_state = jax.tree.map(lambda x: x.copy(), state.env_state)
     warm_up = config.dqn.min_replay_size // decisions + 1
     for _ in range(warm_up):
@@ -61,11 +61,11 @@ def measure(engine: Any, num_envs: int, preset_name: str, rounds: int) -> dict[s
     roll, peer_steps = _peer(env, num_envs)
     seconds: dict[str, list[float]] = {"env": [], "training": [], "batch": []}
     for k in range(rounds):
-        took, (env_state, _) = _timed(lambda s=env_state, k=k: raw(s, jax.random.PRNGKey(k)))
+        took, (env_state, _) = timed(lambda s=env_state, k=k: raw(s, jax.random.PRNGKey(k)))
         seconds["env"].append(took / (decisions * config.task.sim_steps))
-        took, (state, _) = _timed(lambda s=state: train(s))
+        took, (state, _) = timed(lambda s=state: train(s))
         seconds["training"].append(took / (decisions * config.task.sim_steps))
-        took, _ = _timed(roll)
+        took, _ = timed(roll)
         seconds["batch"].append(took / peer_steps)
     rate = {name: 1 / statistics.median(values) for name, values in seconds.items()}
     device = jax.devices()[0]
@@ -87,8 +87,14 @@ def measure(engine: Any, num_envs: int, preset_name: str, rounds: int) -> dict[s
     }
 
 
-def _random_program(learner, iterations: int) -> Callable[..., Any]:
-    """The env alone: random actions, done robots reset, as in training."""
+def env_program(learner, iterations: int, act: Callable[..., Any] | None = None):
+    """The env alone, done robots reset as in training: state and key -> state.
+
+    Args:
+      learner: of the env and the devices.
+      iterations: decisions of every env.
+      act: observations (n, obs_size) -> actions (n,); random ones if none.
+    """
     import jax
     import jax.numpy as jnp
 
@@ -100,7 +106,9 @@ def _random_program(learner, iterations: int) -> Callable[..., Any]:
 
     def step(state, key):
         key_act, key_reset = jax.random.split(device_key(key))
-        action = jax.random.randint(key_act, state.reward.shape, 0, env.action_size)
+        shape = state.reward.shape
+        drawn = jax.random.randint(key_act, shape, 0, env.action_size)
+        action = drawn if act is None else act(state.obs)
         return reset_done(env.reset, jax.vmap(env.step)(state, action), key_reset), None
 
     def program(state, key):
@@ -119,7 +127,8 @@ def _random_program(learner, iterations: int) -> Callable[..., Any]:
     )
 
 
-def _compiled(program: Callable[..., Any], state: Any) -> tuple[Callable[..., Any], float]:
+def compiled(program: Callable[..., Any], state: Any) -> tuple[Callable[..., Any], float]:
+    """A program for such states, and the seconds that it took to compile."""
     import jax
     from brax.envs.base import State
 
@@ -161,7 +170,8 @@ def _peer(env, num_envs: int) -> tuple[Callable[[], Any], int]:
     return roll, repeats * num_envs * config.task.sim_steps
 
 
-def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
+def timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds of a call, and what it gave."""
     import jax
 
     began = time.perf_counter()

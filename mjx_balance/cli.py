@@ -107,7 +107,9 @@ def _train(argv: list[str]) -> int:
 
     engine = parsed.config.engine
     with quiet_imports("torch", *(["warp"] if engine != "warp" else [])):
-        from mjx_balance.training import processes, run
+        from jax.errors import JaxRuntimeError
+
+        from mjx_balance.training import devices, processes, run
     from mjx_balance.display import Display
     from mjx_balance.training.checkpoints import CheckpointError
 
@@ -127,6 +129,12 @@ def _train(argv: list[str]) -> int:
         return FAILED
     except PolicyError as error:
         _complain(str(error))
+        return FAILED
+    except JaxRuntimeError as error:
+        said = devices.explained(error)
+        if said is None:
+            raise
+        _complain(said)
         return FAILED
     except OSError as error:  # a full disk: what is saved stays, and can be resumed
         _complain(f"cannot write {error.filename or 'the run'}: {error.strerror}")

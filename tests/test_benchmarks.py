@@ -49,7 +49,7 @@ def test_the_env_that_throughput_times_moves_on_every_device() -> None:
     script = runpy.run_path(str(BENCHMARKS / "throughput.py"))
     start = learner.init(0).env_state
     seen = np.asarray(start.obs)
-    after, _ = script["_random_program"](learner, 1)(start, jax.random.PRNGKey(0))
+    after, _ = script["env_program"](learner, 1)(start, jax.random.PRNGKey(0))
     assert np.asarray(after.obs).shape == seen.shape
     assert (np.asarray(after.obs) != seen).all()
 

@@ -135,3 +135,13 @@ def check_memory(learner: Learner) -> None:
             f"{learner.config.replay_capacity}: that takes about {needed / 2**30:.1f} GiB, and "
             f"{available / 2**30:.1f} GiB are free; lower one of them"
         )
+
+
+def explained(error: Exception) -> str | None:
+    """What the user can do about an error of a running program, in a sentence; none if unknown."""
+    said = str(error)
+    if "RESOURCE_EXHAUSTED" in said:
+        return "the device has no memory left; lower num_envs, num_seeds or replay_capacity"
+    if "WarpOverflowError: " in said:
+        return said.partition("WarpOverflowError: ")[2].splitlines()[0]
+    return None

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import jax
-from jax._src.clusters import ClusterEnv
 
 T = TypeVar("T")
 
@@ -59,6 +58,8 @@ def find_place(address: str | None, index: int | None, count: int | None) -> Pla
     Raises:
       ProcessError: if neither tells.
     """
+    from jax._src.clusters import ClusterEnv  # no public name leads to it
+
     told = (address, index, count)
     try:
         address, count, index, devices = ClusterEnv.auto_detect_unset_distributed_params(

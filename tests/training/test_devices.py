@@ -14,7 +14,7 @@ from mjx_balance.config import ConfigError, preset
 from mjx_balance.dqn import learner as learner_module
 from mjx_balance.env import BalanceEnv
 from mjx_balance.training import devices
-from mjx_balance.training.devices import check_memory, make_learner, size_to_device
+from mjx_balance.training.devices import check_memory, explained, make_learner, size_to_device
 
 CONFIG = preset("default")
 
@@ -170,3 +170,22 @@ def test_every_accelerator_takes_its_share(monkeypatch: pytest.MonkeyPatch) -> N
         check_memory(too_much)
     unknown: Any = Learner(gpu(None))
     check_memory(unknown)
+
+
+def test_errors_of_a_running_program_are_explained_where_they_can_be() -> None:
+    made = jax.errors.JaxRuntimeError
+    memory = made("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 94371840000 bytes.")
+    assert explained(memory) == (
+        "the device has no memory left; lower num_envs, num_seeds or replay_capacity"
+    )
+    full = made(
+        "INTERNAL: CpuCallback error: Traceback\n  x.py\nmine.WarpOverflowError: a buffer\n--"
+    )
+    assert explained(full) == "a buffer"
+    assert explained(made("INTERNAL: something else")) is None
+
+
+def test_an_allocation_that_no_memory_takes_is_explained() -> None:
+    with pytest.raises(jax.errors.JaxRuntimeError) as caught:
+        jax.block_until_ready(jnp.zeros((2**22, 2**22), jnp.float32))
+    assert "no memory left" in (explained(caught.value) or "")

@@ -4,13 +4,14 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from mjx_balance.training import processes
 from mjx_balance.training.processes import (
     Place,
     ProcessError,
@@ -216,6 +217,28 @@ def test_a_port_that_is_taken_is_said() -> None:
         address = f"localhost:{server.getsockname()[1]}"
         with pytest.raises(ProcessError, match=f"process 0 cannot listen at {address}: Address al"):
             meet(Place(address, 0, 2), 1)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux binds processes to cores")
+def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that may use the same ones; whoever was bound already stays where it is."""
+    mine = threading.local()
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: mine.cores)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: setattr(mine, "cores", cores))
+
+    def bound(all_cores: Sequence[set[int]]) -> list[list[int]]:
+        def work(us: Processes) -> Any:
+            mine.cores = all_cores[us.index]
+            processes._share_cores(us)
+            return sorted(mine.cores)
+
+        return together(len(all_cores), work)
+
+    shared = bound([set(range(2, 7))] * 3)
+    assert sorted(core for cores in shared for core in cores) == [2, 3, 4, 5, 6]
+    assert {len(cores) for cores in shared} == {1, 2}
+    assert bound([{0, 1}, {2, 3}]) == [[0, 1], [2, 3]]
+    assert bound([{4}, {4}]) == [[4], [4]], "too few to share"
 
 
 @pytest.mark.parametrize(
