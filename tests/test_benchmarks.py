@@ -422,3 +422,70 @@ def test_replay_compares_as_many_adds_and_samples(monkeypatch: pytest.MonkeyPatc
     rows = module.measure(1, 256, 1, 3)
     assert [row["buffer"] for row in rows] == ["filling", "full"]
     assert all(row["ours_over_best_other"] < 0.5 for row in rows)
+
+
+def test_a_validation_passes_without_a_fall_in_both_suites(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A line that is half written, or of no validation, says nothing."""
+    passes = load("accelerator", monkeypatch).passes
+    file = tmp_path / "metrics.jsonl"
+    assert not passes(file, 0.2)
+    names = [
+        f"eval/{suite}/{what}" for what in ("tilt_mean", "falls") for suite in ("paper", "corner")
+    ]
+    lines = [json.dumps({"env_steps": 1})]
+    for tilts, good in (((0.1, 0.3), False), ((0.1, 0.1, 0, 1), False), ((0.19, 0.2, 0, 0), True)):
+        lines.append(json.dumps(dict(zip(names, (*tilts, 0, 0)[:4], strict=True))))
+        file.write_text("\n".join(lines))
+        assert not passes(file, 0.2)
+        file.write_text("\n".join(lines) + "\n")
+        assert passes(file, 0.2) == good
+    assert not passes(file, 0.19)
+
+
+def test_a_part_that_fails_or_takes_too_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = load("accelerator", monkeypatch)
+    parts = module.Parts(1_000)
+    assert parts.lines("rates", "steam", "--sizes", "8") == []
+    [failure] = parts.failures
+    assert failure.startswith("rates, steam: ")
+    assert "engine is 'steam'; it must be one of mjx, mujoco, warp" in failure
+    assert module.Parts(9).lines("rates", "mjx", "--sizes", "8") == []
+    slow = module.Parts(1_000)
+    monkeypatch.setitem(module.SHARES, "rates", 0.0101)
+    assert slow.lines("rates", "mjx", "--sizes", "64") == []
+    assert slow.failures == ["rates, mjx: stopped after 10 s"]
+
+
+def test_what_a_machine_gave_is_written_down_with_what_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    row = {"engine": "mjx", "device": "1 x H", "num_envs": 2048, "physics_steps_per_second": 5e6}
+    row |= {"compile_s": 40.2, "device_memory_mib": None}
+    tilt = {"mean": 0.07, "p95": 0.2, "max": 1.1, "falls": 0, "of": 128}
+    found = {
+        "hardware": {"cpu": "a", "cores": 16, "gpu": ["NVIDIA H100, 81559 MiB"]},
+        "versions": {"jax": "0.11", "warp-lang": None},
+        "rates": [row],
+        "training": [row | {"share_of_rate": 0.876}],
+        "runs": [
+            {
+                "start": "warm",
+                "engine": "mjx",
+                "reached_s": {0.2: 9.04},
+                "evaluation": {"paper": tilt},
+            }
+        ],
+        "failures": ["warp: warp-lang is not installed"],
+        "seconds": 300.4,
+    }
+    text = "\n".join(load("accelerator", monkeypatch).shown(found))
+    assert "a, 16 cores, NVIDIA H100, 81559 MiB; jax 0.11." in text
+    assert "| `mjx` | 1 x H | 2,048 | 5,000,000 | - | 40 s | - |" in text
+    assert "| 0.88 | 40 s |" in text
+    assert (
+        "`train.py --engine mjx`, warm: 0.2 deg after 9.0 s, 0.1 deg never; `paper` 0.070" in text
+    )
+    assert "- warp: warp-lang is not installed" in text
+    assert text.endswith("300 s in all.")
