@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar, cast
 
 import jax
 
@@ -58,18 +58,19 @@ def find_place(address: str | None, index: int | None, count: int | None) -> Pla
     Raises:
       ProcessError: if neither tells.
     """
-    from jax._src.clusters import ClusterEnv  # no public name leads to it
+    told, devices = (address, index, count), None
+    if None in told:
+        from jax._src.clusters import ClusterEnv  # no public name leads to it
 
-    told = (address, index, count)
-    try:
-        address, count, index, devices = ClusterEnv.auto_detect_unset_distributed_params(
-            address, count, index, None, None, int(PATIENCE_S)
-        )
-    except Exception as error:  # whatever a cluster's own library raises
-        said = " ".join(str(error).split())
-        raise ProcessError(
-            f"the cluster cannot be asked for this process's place: {said}"
-        ) from error
+        try:
+            address, count, index, devices = ClusterEnv.auto_detect_unset_distributed_params(
+                address, count, index, None, None, int(PATIENCE_S)
+            )
+        except Exception as error:  # whatever a cluster's own library raises
+            said = " ".join(str(error).split())
+            raise ProcessError(
+                f"the cluster cannot be asked for this process's place: {said}"
+            ) from error
     if address is None or count is None or index is None:
         names = ("--coordinator", "--process-id", "--num-processes")
         missing = [name for name, x in zip(names, told, strict=True) if x is None]
@@ -157,6 +158,27 @@ class Processes:
             raise
         self.gather([value, None, None])
         return value
+
+    def everywhere(self, function: Callable[[], T], *errors: type[Exception]) -> T:
+        """What a function gives in this process, once it has given something in all of them.
+
+        Args:
+          function: called in every process.
+          errors: what it may raise; all processes raise it then, with the message of the first.
+        """
+        value, raised = None, None
+        try:
+            value = function()
+        except errors as error:
+            raised = error
+        said = None if raised is None else [type(raised).__name__, str(raised)]
+        for other, theirs in enumerate(self.gather(said)):
+            if theirs is not None and raised is None:
+                kind = next(kind for kind in errors if kind.__name__ == theirs[0])
+                raised = kind(f"process {other}: {theirs[1]}")
+        if raised is not None:
+            raise raised
+        return cast(T, value)
 
     def check_same(self, values: Mapping[str, Any]) -> None:
         """Compares what the processes were started with.
@@ -308,7 +330,7 @@ def _await_all(place: Place, until: float, patience: float) -> dict[int, socket.
     _, port = _host_and_port(place)
     found: dict[int, socket.socket] = {}
     try:
-        server = socket.create_server(("", port), backlog=place.count)
+        server = _listening(port)
     except OSError as error:
         raise ProcessError(
             f"process 0 cannot listen at {place.address}: {error.strerror}"
@@ -337,6 +359,13 @@ def _await_all(place: Place, until: float, patience: float) -> dict[int, socket.
     return found
 
 
+def _listening(port: int) -> socket.socket:
+    """A server on all of this machine's addresses; port 0: any that is free."""
+    if socket.has_dualstack_ipv6():
+        return socket.create_server(("", port), family=socket.AF_INET6, dualstack_ipv6=True)
+    return socket.create_server(("", port))
+
+
 def _line(connection: socket.socket) -> bytes:
     """The first line that comes, byte by byte: what follows is another's to read."""
     line = b""
@@ -360,7 +389,9 @@ def _keep_watch(connection: socket.socket) -> None:
     connection.settimeout(None)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):
+    limits = {"TCP_KEEPIDLE": SILENCE_S - 20, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 4}
+    limits["TCP_USER_TIMEOUT"] = 1000 * SILENCE_S  # ms; of what was sent and not received
+    for name, value in limits.items():
         if hasattr(socket, name):  # not everywhere
             connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
@@ -395,5 +426,5 @@ def _connect_devices(processes: Processes, place: Place) -> None:
 
 
 def _free_port() -> int:
-    with socket.create_server(("", 0)) as server:
+    with _listening(0) as server:
         return server.getsockname()[1]

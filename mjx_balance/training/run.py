@@ -70,11 +70,8 @@ def train(
     began = time.perf_counter()
     with joined(place, ORDERLY) as processes:
         devices.configure_jax(display.say)
-        config = devices.size_to_device(check(config))
-        finish.check_fits(config)
-        env = BalanceEnv(config)
-        learner = devices.make_learner(config, env)
-        devices.check_memory(learner)
+        wanted = config
+        config, env, learner = processes.everywhere(lambda: _make(wanted), ConfigError)
         folder = _open_folder(config, provenance(env), run_dir, resume, display.say, processes)
         with _locked(folder, processes), _resumable(folder):
             with loop.Interrupts(display.say) as stop:
@@ -101,6 +98,16 @@ def train(
             if not processes.first:
                 return None
             return finish.finish(config, policies, folder, display, began)
+
+
+def _make(config: Config) -> tuple[Config, BalanceEnv, Learner]:
+    """The config, sized to the devices, its env and its learner, which fit into the memory."""
+    config = devices.size_to_device(check(config))
+    finish.check_fits(config)
+    env = BalanceEnv(config)
+    learner = devices.make_learner(config, env)
+    devices.check_memory(learner)
+    return config, env, learner
 
 
 def provenance(env: BalanceEnv) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import pytest
 
 from mjx_balance.training import processes
 from mjx_balance.training.processes import (
+    ALONE,
     Place,
     ProcessError,
     Processes,
@@ -107,6 +108,23 @@ def test_the_first_one_acts_for_all() -> None:
 
     assert together(2, work) == [([7], [0, 1])] * 2
     assert calls == [0]
+
+
+def test_what_fails_in_one_process_fails_in_all() -> None:
+    def work(us: Processes) -> Any:
+        def check() -> int:
+            if us.index == 1:
+                raise FileNotFoundError("no memory")
+            return us.index
+
+        values = [us.everywhere(lambda: us.index)]
+        with pytest.raises(FileNotFoundError) as caught:
+            us.everywhere(check, KeyError, FileNotFoundError)
+        return values, str(caught.value), us.gather(us.index)
+
+    said = ["process 1: no memory", "no memory", "process 1: no memory"]
+    assert together(3, work) == [([k], said[k], [0, 1, 2]) for k in range(3)]
+    assert ALONE.everywhere(lambda: 3) == 3
 
 
 def test_what_differs_is_named_by_all() -> None:
