@@ -30,6 +30,8 @@ class TrainArgs:
     """Folder to create for the run; none: runs/PRESET-SEED-TIME."""
     resume: Path | None = None
     """Run folder to continue instead."""
+    profile: bool = False
+    """Trace a call of the training program, and tell what share of it each part takes."""
     distributed: bool = False
     """Be one of several processes, on one machine or many, that Slurm, Open MPI or Kubernetes has
     started; or one that the next three flags place. All get the same other flags."""
@@ -121,7 +123,7 @@ def _train(argv: list[str]) -> int:
             place = processes.find_place(*where)
             if place.index:
                 display = Display(Console(quiet=True))
-        run.train(parsed.config, parsed.run_dir, parsed.resume, display, place)
+        run.train(parsed.config, parsed.run_dir, parsed.resume, display, place, parsed.profile)
     except (ConfigError, RunFolderError, CheckpointError, processes.ProcessError) as error:
         return _complain(str(error))
     except processes.ProcessLostError as error:

@@ -142,7 +142,8 @@ class BalanceEnv(Env):
         if "kicks" in info:
             added = kick(Pushes(info["kicks"], self._kicked), info["decision"])
             before = before._replace(qvel=before.qvel.at[self.scene.trunk_velocity].add(added))
-        moved, motion = self._engine(before, self.scene.ctrl(targets), conditions)
+        with jax.named_scope("physics"):
+            moved, motion = self._engine(before, self.scene.ctrl(targets), conditions)
         samples = motion.imu
         if conditions is not None:
             key, key_noise = jax.random.split(info["noise_key"])

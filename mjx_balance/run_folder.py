@@ -99,6 +99,11 @@ class RunFolder:
         return self.path / "figures"
 
     @property
+    def profile(self) -> Path:
+        """A trace of one call of the training program, where one was asked for."""
+        return self.path / "profile"
+
+    @property
     def report(self) -> Path:
         """What the report measured, so that it need not be measured again."""
         return self.path / "report.json"

@@ -37,7 +37,7 @@ FLOORS = (
     ("report.page",),
     ("training.processes",),
     ("training.checkpoints", "training.program_cache"),
-    ("training.devices", "training.loop"),
+    ("training.devices", "training.loop", "training.profiling"),
     ("training.validation",),
     ("training.finish",),
     ("training.run",),

@@ -233,13 +233,16 @@ class Learner:
         inputs = jax.lax.cond(watching, self._watch, lambda state: state.inputs, state)
         state = state._replace(inputs=inputs)
         seen = self._collect(state, rate, key_act, key_reset)
+        with jax.named_scope("replay"):
+            stored = replay.add(state.replay, seen.transition, seen.storable)
         state = state._replace(
             env_state=seen.env_state,
-            replay=replay.add(state.replay, seen.transition, seen.storable),
+            replay=stored,
             env_steps=state.env_steps + self.num_envs,
             key=key,
         )
-        state, loss = self._learn(state, device_key(key_learn))
+        with jax.named_scope("updates"):
+            state, loss = self._learn(state, device_key(key_learn))
         return state, seen.metrics | loss | {"epsilon": Mean(rate, jnp.float32(1.0))}
 
     def _watch(self, state: TrainState) -> InputStatistics:
@@ -259,11 +262,14 @@ class Learner:
     ) -> Collected:
         """Takes one decision of each of this device's envs."""
         obs = array(state.env_state.obs)
-        greedy = self._q_values(self._folded(state.params, state.inputs), obs).greedy()
-        keys = jax.random.split(device_key(key_act), len(obs))
-        act = partial(explore, factors=self.action_factors, levels=self.config.exploration_noise)
-        action = jax.vmap(act, (0, 0, None))(keys, greedy, rate)
-        return collect(self.env, state.env_state, action, device_key(key_reset))
+        with jax.named_scope("acting"):
+            greedy = self._q_values(self._folded(state.params, state.inputs), obs).greedy()
+            keys = jax.random.split(device_key(key_act), len(obs))
+            levels = self.config.exploration_noise
+            act = partial(explore, factors=self.action_factors, levels=levels)
+            action = jax.vmap(act, (0, 0, None))(keys, greedy, rate)
+        with jax.named_scope("env"):
+            return collect(self.env, state.env_state, action, device_key(key_reset))
 
     def _learn(self, state: TrainState, key: jax.Array) -> tuple[TrainState, dict[str, Mean]]:
         """Makes one iteration's updates, once the replay is warm.
@@ -296,7 +302,8 @@ class Learner:
     def _batch(self, buffer: ReplayState, key: jax.Array) -> Transition:
         """This device's share of a batch, reflected if asked for."""
         key, key_mirror = jax.random.split(key)
-        batch = replay.sample(buffer, key, self.config.batch_size // self.num_devices)
+        with jax.named_scope("replay"):
+            batch = replay.sample(buffer, key, self.config.batch_size // self.num_devices)
         return batch if self.symmetries is None else mirrored(self.symmetries, batch, key_mirror)
 
     def _q_values(self, params: Params, obs: jax.Array) -> Head:

@@ -127,7 +127,7 @@ def compiler_options() -> dict[str, str | bool]:
 
 def compile_program(
     program: Callable[[Any], tuple[Any, Any]], state: Any, key: str | None, say: Say
-) -> Callable[[Any], tuple[Any, Any]]:
+) -> "CompiledProgram":
     """Compiles a jitted `state -> (state, output)`, from the cache where it can.
 
     Args:
@@ -151,11 +151,23 @@ def compile_program(
     lowered = jax.jit(traced, donate_argnums=0).lower(leaves)
     compiled = lowered.compile(compiler_options())
 
-    def run(state: Any) -> tuple[Any, Any]:
-        leaves, output = compiled(jax.tree.leaves(state))
-        return jax.tree.unflatten(structure, leaves), output
+    return CompiledProgram(compiled, structure)
 
-    return run
+
+class CompiledProgram:
+    """`state -> (state, output)`; it is not traced again, whatever it is given."""
+
+    def __init__(self, compiled: Any, structure: Any):
+        """Of a compiled function of the state's leaves."""
+        self._compiled, self._structure = compiled, structure
+
+    def __call__(self, state: Any) -> tuple[Any, Any]:
+        leaves, output = self._compiled(jax.tree.leaves(state))
+        return jax.tree.unflatten(self._structure, leaves), output
+
+    def as_text(self) -> str:
+        """The program as XLA writes it."""
+        return self._compiled.as_text()
 
 
 def _kept(

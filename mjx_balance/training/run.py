@@ -22,8 +22,17 @@ from mjx_balance.run_folder import (
     create_run_folder,
     locked,
     read_run_config,
+    write_json,
 )
-from mjx_balance.training import checkpoints, devices, finish, loop, program_cache, validation
+from mjx_balance.training import (
+    checkpoints,
+    devices,
+    finish,
+    loop,
+    profiling,
+    program_cache,
+    validation,
+)
 from mjx_balance.training.checkpoints import CheckpointError
 from mjx_balance.training.processes import ALONE, Place, Processes, joined
 from mjx_balance.training.program_cache import Say
@@ -43,6 +52,7 @@ def train(
     resume: Path | None,
     display: Display,
     place: Place | None = None,
+    profile: bool = False,
 ) -> finish.Results | None:
     """Runs or continues a training and everything that follows it.
 
@@ -52,6 +62,7 @@ def train(
       resume: folder to continue instead.
       display: shows progress.
       place: of this process among several; the first one of them writes, shows and evaluates.
+      profile: whether to trace a call of the training program and sum it up.
 
     Returns:
       The evaluation, suite name -> JSON of `evaluation.summarize`; none where another process
@@ -78,7 +89,9 @@ def train(
                 validate = functools.partial(
                     validation.validate, config, learner, env.scene, folder
                 )
-                state, seconds = _learn(config, learner, folder, display, stop, validate, processes)
+                state, seconds = _learn(
+                    config, learner, folder, display, stop, validate, processes, profile
+                )
                 policies: list[Policy] = []
 
                 def export() -> None:
@@ -172,6 +185,7 @@ def _learn(
     stop: loop.Interrupts,
     validate: loop.Validate,
     processes: Processes = ALONE,
+    profile: bool = False,
 ) -> tuple[TrainState, float]:
     """Goes on from the newest checkpoint, if there is one, to the last decision.
 
@@ -188,11 +202,26 @@ def _learn(
             state = saved
             display.say(f"resuming at {loop.number(state.env_steps):,} decisions")
         if loop.number(state.env_steps) < plan.total:
-            key = program_cache.program_key(config, plan.iterations, devices.__name__)
-            key = None if config.engine == "warp" else key  # its kernels live in this process
+            # Warp's kernels live in this process; a cache keeps no names to profile by.
+            key = None
+            if config.engine != "warp" and not profile:
+                key = program_cache.program_key(config, plan.iterations, devices.__name__)
+            if profile:
+                jax.config.update("jax_enable_compilation_cache", False)
             program = stop.run(program_cache.compile_program, program, state, key, display.say)
+            if profile and processes.first:
+                shown = functools.partial(_shown, display, folder)
+                program = profiling.Profiled(program, folder.profile, shown)
     processes.gather(None)  # whoever compiles longest is awaited here, where nothing times out
     return loop.learn(plan, program, state, folder, display, stop, validate, processes)
+
+
+def _shown(display: Display, folder: RunFolder, shares: Mapping[str, float]) -> None:
+    """Shows and keeps what a profile says."""
+    write_json(folder.profile / "shares.json", shares)
+    display.say(f"a call of the training program, traced in {folder.profile}:")
+    for name, share in shares.items():
+        display.say(f"  {name:<9}{share:6.1%}  {profiling.MEANING[name]}")
 
 
 @contextlib.contextmanager

@@ -1,6 +1,8 @@
 """Whole runs of two processes on one machine, over gloo, as on two machines of a cluster."""
 
+import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -73,10 +75,14 @@ def wait(when: Callable[[], object]) -> None:
 
 @pytest.fixture(scope="module")
 def alone(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """The run as one process with two devices makes it."""
+    """The run as one process with two devices makes it, profiled."""
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "alone")
-    code, said = end(start(cache, *FLAGS, "--run-dir", str(folder.path)))
+    code, said = end(start(cache, *FLAGS, "--profile", "--run-dir", str(folder.path)))
     assert code == 0, said
+    shares = json.loads((folder.profile / "shares.json").read_text())
+    assert sum(shares.values()) == pytest.approx(1)
+    assert shares["physics"] > 0.3
+    assert re.search(r"\n  physics +\d+\.\d%  the engine's steps", said), said
     return folder
 
 
@@ -97,7 +103,7 @@ def test_two_processes_make_the_run_of_one_with_two_devices(
     assert other_said == "", "one of them speaks"
     assert fingerprint(folder) == fingerprint(alone)
     assert len(folder.metrics.read_text().splitlines()) == 4
-    names = {path.name for path in alone.path.iterdir()}
+    names = {path.name for path in alone.path.iterdir()} - {"profile"}
     assert {path.name for path in folder.path.iterdir()} == names
 
 

@@ -1,0 +1,69 @@
+"""What a profile makes of a trace: whose an operation is, and how long it took by itself."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from mjx_balance.training import profiling
+from mjx_balance.training.profiling import MEANING, SCOPES, Event, Profiled, scopes, shares
+from mjx_balance.training.program_cache import compile_program
+
+PROGRAM = """
+  %while.3 = (s32[]) while(%tuple.1), metadata={op_name="jit(program)/updates/while/body/replay/add"}
+  ROOT %fusion.12 = f32[8]{0} fusion(%a), kind=kLoop, metadata={stack_frame_id=4 op_name="jit(p)/vmap(env)/vmap(physics)/dot"}
+  %all-reduce.1 = f32[3] all-reduce(%b), metadata={op_name="jit(program)/updates/while/psum"}
+  %copy.4 = f32[3] copy(%b), metadata={op_name="jit(environment)/mul"}
+  %bare.1 = f32[3] copy(%b)
+"""  # noqa: E501
+
+
+def test_an_operation_belongs_to_the_innermost_of_our_names() -> None:
+    assert scopes(PROGRAM) == {
+        "while.3": "replay",
+        "fusion.12": "physics",
+        "all-reduce.1": "exchange",
+        "copy.4": "other",
+    }
+    assert set(MEANING) == {*SCOPES, "exchange", "other", "host"}
+
+
+def test_what_runs_within_an_operation_is_not_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two threads of one device: 0 to 100 ns, in which two run that hold one another."""
+    outer, inner = Event("while.3", 0, 60), Event("fusion.12", 10, 30)
+    innermost, after = Event("copy.4", 15, 5), Event("fusion.12", 60, 10)
+    other_thread = Event("all-reduce.1", 80, 20)
+    timelines = [[after, inner, outer, innermost], [other_thread]]
+    monkeypatch.setattr(profiling, "_timelines", lambda folder: iter(timelines))
+    found = shares(Path(), scopes(PROGRAM))
+    wanted = {"physics": 0.35, "replay": 0.3, "exchange": 0.2, "host": 0.1, "other": 0.05}
+    assert found == pytest.approx(wanted)
+    assert list(found) == list(wanted), "the largest first"
+    monkeypatch.setattr(profiling, "_timelines", lambda folder: iter([]))
+    assert shares(Path(), scopes(PROGRAM)) == {}
+
+
+def test_one_call_is_traced_and_gives_what_the_others_give(tmp_path: Path) -> None:
+    """Products of large matrices are the physics here, those of small ones the updates."""
+
+    def step(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        with jax.named_scope("physics"):
+            x = jax.lax.fori_loop(0, 30, lambda _, x: jnp.tanh(x @ x), x)
+        with jax.named_scope("updates"):
+            small = jax.lax.fori_loop(0, 30, lambda _, y: jnp.tanh(y @ y), x[:30, :30])
+        return x, small.sum()
+
+    start = jnp.eye(300) / 2
+    program = compile_program(jax.jit(step), start, None, pytest.fail)
+    found: list[Any] = []
+    profiled = Profiled(program, tmp_path, found.append)
+    sums = []
+    for call in range(6):
+        sums.append(float(profiled(start + 0)[1]))
+        assert len(found) == (call >= 3)
+        assert any(tmp_path.rglob("*.xplane.pb")) == (call >= 3)
+    assert len(set(sums)) == 1
+    assert sum(found[0].values()) == pytest.approx(1)
+    assert found[0]["physics"] > 0.5 > 5 * found[0]["updates"] > 0
