@@ -1,4 +1,4 @@
-"""The command line: `mjx-balance train`, `evaluate` and `report`."""
+"""The command line: `mjx-balance train`, `sweep`, `evaluate` and `report`."""
 
 import argparse
 import dataclasses
@@ -19,7 +19,7 @@ from mjx_balance.run_folder import RunFolderError, read_run_config
 FAILED = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
-COMMANDS = ("train", "evaluate", "report")
+COMMANDS = ("train", "sweep", "evaluate", "report")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,11 +84,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if arguments is None else arguments)
     if not argv or argv[0] not in COMMANDS:
         wants_help = bool(argv) and argv[0] in ("-h", "--help")
-        print("usage: mjx-balance {train,evaluate,report} ... (--help after one lists its flags)")
+        print(f"usage: mjx-balance {{{','.join(COMMANDS)}}} ... (--help after one lists its flags)")
         if argv and not wants_help:
             _complain(f"unknown command {argv[0]!r}; known commands: {', '.join(COMMANDS)}")
         return 0 if wants_help else USAGE_ERROR
-    return {"train": _train, "evaluate": _evaluate, "report": _report}[argv[0]](argv[1:])
+    commands = {"train": _train, "sweep": _sweep, "evaluate": _evaluate, "report": _report}
+    return commands[argv[0]](argv[1:])
+
+
+def _sweep(argv: list[str]) -> int:
+    """`mjx-balance sweep gamma=0.1,0.4 @FILE ... [flags of train]`: a train with `--sweep`."""
+    count = next((k for k, text in enumerate(argv) if text.startswith("-")), len(argv))
+    entries = []
+    for text in argv[:count]:
+        if not text.startswith("@"):
+            entries.append(text)
+            continue
+        try:
+            entries += Path(text[1:]).read_text().split()
+        except (OSError, UnicodeDecodeError) as error:
+            return _complain(f"the values in {text[1:]} cannot be read: {error}")
+    if not entries and "--resume" not in argv and "--help" not in argv:
+        return _complain(
+            "say what to try, as gamma=0.1,0.4, or @FILE with such entries, before train's flags"
+        )
+    return _train([*argv[count:], *(["--sweep", *entries] if entries else [])])
 
 
 def _train(argv: list[str]) -> int:

@@ -8,6 +8,7 @@ Sources: "paper n" is a section of the paper, "chosen" a number the paper does n
 """
 
 import dataclasses
+import itertools
 import json
 import math
 import types
@@ -233,6 +234,9 @@ class Config:
     """Envs simulated at once; none: sized to the device."""
     num_seeds: int = bounded(1, least=1)
     """Runs trained at once in one program, with seeds `seed`, `seed + 1`, ..."""
+    sweep: tuple[str, ...] = ()
+    """Numbers of the learner to try, as `learning_rate=0.001,0.003`: every combination is trained
+    with `num_seeds` seeds, all in one program."""
     num_env_steps: int = bounded(200_000, least=1)
     """Decisions of a run, over all envs (paper 4: about 200k)."""
     num_devices: int | None = bounded(None, least=1)
@@ -372,13 +376,62 @@ def greatest_incline(task: TaskConfig, robot: Robot) -> float:
     return math.degrees(math.atan(room / (robot.hip_x + robot.half_track)))
 
 
+SWEEPABLE = (
+    *("learning_rate", "learning_rate_end_share", "gamma", "huber_delta", "max_grad_norm"),
+    *("epsilon_start", "epsilon_end", "epsilon_decay_steps"),
+)
+"""Fields of `DQNConfig` that only enter into sums and products."""
+
+
+def combinations(config: Config) -> list[dict[str, float]]:
+    """What a sweep tries, the last of its fields varying fastest; one empty one if there is none.
+
+    Raises:
+      ConfigError: naming the entry that is none.
+    """
+    fields: dict[str, list[float]] = {}
+    for entry in config.sweep:
+        name, _, listed = entry.partition("=")
+        if name not in SWEEPABLE or name in fields:
+            raise ConfigError(
+                f"sweep is {shown(entry)}; it must name one of {', '.join(SWEEPABLE)}, each at "
+                "most once, and its values, as gamma=0.1,0.4"
+            )
+        try:
+            fields[name] = [float(value) for value in listed.split(",")]
+        except ValueError as error:
+            raise ConfigError(
+                f"sweep is {shown(entry)}; after {name}= it must list numbers, as 0.1,0.4"
+            ) from error
+    tried = itertools.product(*fields.values())
+    return [dict(zip(fields, values, strict=True)) for values in tried]
+
+
+def members(config: Config) -> list[Config]:
+    """The runs that are trained in one program, each as a config of its own.
+
+    Their seeds follow each other, so that no two have one name.
+    """
+    found = []
+    for values in combinations(config):
+        whole = {k: int(v) if k == "epsilon_decay_steps" else v for k, v in values.items()}
+        dqn = dataclasses.replace(config.dqn, **whole)
+        for _ in range(config.num_seeds):
+            seed = config.seed + len(found)
+            own = dataclasses.replace(config, seed=seed, num_seeds=1, sweep=(), dqn=dqn)
+            found.append(own)
+    return found
+
+
 def check(config: Config) -> Config:
     """Returns `config` if it can be run; raises `ConfigError` with one sentence if not."""
     for section in (config, config.task, config.randomization, config.dqn):
         _check_fields(section)
     if config.preset not in PRESETS:
         preset(config.preset)
-    if config.seed + config.num_seeds > 2**31:
+    for own in members(config) if config.sweep else ():
+        _check_fields(own.dqn)
+    if config.seed + len(combinations(config)) * config.num_seeds > 2**31:
         raise ConfigError(f"seed is {config.seed}; the last of all seeds must be less than 2**31")
     try:
         robot = find_robot(config.robot)
@@ -440,7 +493,7 @@ def _mismatch(value: Any, hint: Any) -> str | None:
         return None if value in options else f"one of {', '.join(options)}"
     if typing.get_origin(hint) is tuple:
         good = isinstance(value, tuple) and not any(_mismatch(x, options[0]) for x in value)
-        return None if good else "whole numbers"
+        return None if good else "whole numbers" if options[0] is int else "texts"
     if hint is float:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         # A float that is none, or an int beyond every float, is no number to compute with.

@@ -78,6 +78,11 @@ class RunFolder:
         return self.path / "seeds.json"
 
     @property
+    def sweep(self) -> Path:
+        """What each combination of a sweep's values has come to, the best first."""
+        return self.path / "sweep.json"
+
+    @property
     def seeds(self) -> Path:
         """Policy and evaluation of every seed, where there are several."""
         return self.path / "seeds"

@@ -189,7 +189,12 @@ def test_resuming_a_finished_run_is_refused(
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("fly",), "unknown command 'fly'; known commands: train, evaluate, report"),
+        (("fly",), "unknown command 'fly'; known commands: train, sweep, evaluate, report"),
+        (("sweep",), "say what to try, as gamma=0.1,0.4, or @FILE with such entries, before"),
+        (("sweep", "--seed", "1"), "say what to try, as gamma=0.1,0.4"),
+        (("sweep", "@nowhere"), "the values in nowhere cannot be read"),
+        (("sweep", "@text"), "sweep is 'this'; it must name one of learning_rate"),
+        (("sweep", "gamma=0.1", "tau=1", "--preset", "smoke"), "sweep is 'tau=1'; it must name"),
         (("evaluate", "none.safetensors"), "no policy file at none.safetensors"),
         (("evaluate", "text"), "text is damaged or no safetensors file"),
         (("evaluate",), "name a policy file or --controller NAME"),

@@ -21,6 +21,7 @@ from mjx_balance.config import (
     flatten,
     from_dict,
     greatest_incline,
+    members,
     preset,
     to_dict,
 )
@@ -539,3 +540,44 @@ def test_a_value_of_another_type_is_refused_by_name() -> None:
             if says is None or name not in says:
                 unnoticed.append((section, name, value, says))
     assert not unnoticed
+
+
+SWEEP = ("gamma=0.1,0.4", "epsilon_decay_steps=10,2e3")
+
+
+def test_a_sweep_is_every_combination_with_seeds_of_its_own() -> None:
+    config = dataclasses.replace(preset("default"), seed=7, num_seeds=2, sweep=SWEEP)
+    runs = members(check(config))
+    assert [own.seed for own in runs] == list(range(7, 15))
+    tried = [(own.dqn.gamma, own.dqn.epsilon_decay_steps) for own in runs[::2]]
+    assert tried == [(0.1, 10), (0.1, 2_000), (0.4, 10), (0.4, 2_000)]
+    assert runs[0].dqn == runs[1].dqn
+    for own in runs:
+        assert (own.num_seeds, own.sweep) == (1, ())
+        assert check(own).dqn.learning_rate == config.dqn.learning_rate
+    plain = dataclasses.replace(preset("default"), num_seeds=3)
+    assert members(plain) == [dataclasses.replace(plain, num_seeds=1, seed=k) for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("sweep", "said"),
+    [
+        (("batch_size=1,2",), "sweep is 'batch_size=1,2'; it must name one of learning_rate, "),
+        (("gamma=0.1", "gamma=0.2"), "sweep is 'gamma=0.2'; it must name one of .*at most once"),
+        (("gamma",), "sweep is 'gamma'; after gamma= it must list numbers, as 0.1,0.4"),
+        (("gamma=0.1,",), "sweep is 'gamma=0.1,'; after gamma= it must list numbers"),
+        (("gamma=0.1,1.5",), "gamma is 1.5; it must be at most 1"),
+        (("learning_rate=nan",), "learning_rate is nan; it must be a finite number"),
+        ("gamma=1", "sweep is 'gamma=1'; it must be texts"),
+    ],
+)
+def test_a_sweep_that_cannot_be_is_refused(sweep: Any, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        check(dataclasses.replace(preset("default"), sweep=sweep))
+
+
+def test_the_last_seed_of_a_sweep_counts() -> None:
+    config = dataclasses.replace(preset("default"), seed=2**31 - 4, num_seeds=2, sweep=SWEEP[:1])
+    check(config)
+    with pytest.raises(ConfigError, match="the last of all seeds must be less than"):
+        check(dataclasses.replace(config, seed=config.seed + 1))

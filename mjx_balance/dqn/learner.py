@@ -9,7 +9,8 @@ Several seeds are several runs in one program: every array of the state gets a l
 seed axis and the iteration is vmapped over it.
 """
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any, NamedTuple, TypeAlias
 
@@ -66,6 +67,8 @@ class TrainState(NamedTuple):
     """() updates made."""
     key: jax.Array
     """PRNG key, the same on every device."""
+    swept: dict[str, jax.Array]
+    """() of each field of the config that has another value in every run."""
 
 
 class Learner:
@@ -83,6 +86,7 @@ class Learner:
         symmetries: Symmetries | None = None,
         action_factors: Sequence[int] | None = None,
         first_reset: Reset | None = None,
+        sweep: Mapping[str, Sequence[float]] | None = None,
     ):
         """Sets the programs up; nothing is compiled yet.
 
@@ -98,10 +102,11 @@ class Learner:
           action_factors: sizes of the digits of an action index, along which exploration
             noise moves it; one digit if none.
           first_reset: makes the envs that a run begins with; `env.reset` if none.
+          sweep: values of fields of `config`, one for each run: they take its value's place.
 
         Raises:
-          ValueError: if num_envs or batch_size cannot be split over the devices, or there
-            is nothing to mirror with.
+          ValueError: if num_envs or batch_size cannot be split over the devices, there is
+            nothing to mirror with, or a swept field has another number of values.
         """
         devices = list(devices or jax.devices())
         for name, value in (("num_envs", num_envs), ("batch_size", config.batch_size)):
@@ -111,14 +116,19 @@ class Learner:
                 )
         if config.mirror and symmetries is None:
             raise ValueError("mirror is True, but no symmetries are given to mirror with")
+        for name, values in (sweep or {}).items():
+            if len(values) != num_seeds or num_seeds == 1:
+                raise ValueError(f"{name} has {len(values)} values for {num_seeds} runs")
         self.env, self.network, self.config = env, network, config
+        self.sweep = {
+            name: np.asarray(values, np.float32) for name, values in (sweep or {}).items()
+        }
         self.num_envs, self.num_devices, self.num_seeds = num_envs, len(devices), num_seeds
         self.symmetries = symmetries if config.mirror else None
         self.action_factors = tuple(action_factors or (env.action_size,))
         self.first_reset = first_reset or env.reset
         self.updates = config.updates_per_step(num_envs)
-        iterations = -(-num_env_steps // num_envs)
-        self.optimizer = make_optimizer(config, iterations * self.updates)
+        self.total_updates = -(-num_env_steps // num_envs) * self.updates
         self.mesh = Mesh(np.asarray(devices), (AXIS,), axis_types=(AxisType.Auto,))
         self.trace_count = 0
 
@@ -133,13 +143,13 @@ class Learner:
     def init(self, seed: int) -> TrainState:
         """Builds the state of a new run, or of runs `seed`, `seed + 1`, ..., on its devices."""
         seeds = np.arange(seed, seed + self.num_seeds, dtype=np.int32)
-        return self._init_program(seeds if self.num_seeds > 1 else seeds[0])
+        return self._init_program(seeds if self.num_seeds > 1 else seeds[0], self.sweep)
 
     @cached_property
-    def _init_program(self) -> Callable[[np.ndarray], TrainState]:
+    def _init_program(self) -> Callable[[np.ndarray, Mapping[str, np.ndarray]], TrainState]:
         return jax.jit(
             jax.shard_map(
-                self._each_seed(lambda seed: self.initial(jax.random.PRNGKey(seed))),
+                self._each_seed(lambda seed, swept: self.initial(jax.random.PRNGKey(seed), swept)),
                 mesh=self.mesh,
                 in_specs=REPLICATED,
                 out_specs=self.specs,
@@ -195,7 +205,7 @@ class Learner:
     def _each_seed(self, function: Callable[..., Any], in_axes: Any = 0) -> Callable[..., Any]:
         return jax.vmap(function, in_axes) if self.num_seeds > 1 else function
 
-    def initial(self, key: jax.Array) -> TrainState:
+    def initial(self, key: jax.Array, swept: dict[str, jax.Array]) -> TrainState:
         """The state of one new run; runs on each device."""
         key, key_params, key_env = jax.random.split(key, 3)
         local_envs = self.num_envs // self.num_devices
@@ -208,7 +218,7 @@ class Learner:
         return TrainState(
             params=params,
             target_params=jax.tree.map(jnp.copy, self._folded(params, inputs)),
-            opt_state=self.optimizer.init(params),
+            opt_state=make_optimizer(self.config, self.total_updates).init(params),
             inputs=inputs,
             env_state=env_state,
             replay=replay.init(
@@ -217,7 +227,12 @@ class Learner:
             env_steps=jnp.int32(0),
             gradient_steps=jnp.int32(0),
             key=key,
+            swept=swept,
         )
+
+    def own_config(self, state: TrainState) -> DQNConfig:
+        """The config of one run; swept fields hold arrays."""
+        return dataclasses.replace(self.config, **state.swept)  # pyright: ignore[reportArgumentType]
 
     def iteration(
         self, state: TrainState, watching: jax.Array
@@ -229,7 +244,7 @@ class Learner:
           watching: () whether observations still add to the input statistics.
         """
         key, key_act, key_reset, key_learn = jax.random.split(state.key, 4)
-        rate = epsilon(self.config, state.env_steps)
+        rate = epsilon(self.own_config(state), state.env_steps)
         inputs = jax.lax.cond(watching, self._watch, lambda state: state.inputs, state)
         state = state._replace(inputs=inputs)
         seen = self._collect(state, rate, key_act, key_reset)
@@ -285,10 +300,12 @@ class Learner:
         keys = jax.random.split(key, self.updates)
         fold = partial(self._folded, inputs=state.inputs)
         nothing = Mean(jnp.float32(0.0), jnp.float32(0.0))
+        config = self.own_config(state)
+        optimizer = make_optimizer(config, self.total_updates)
 
         def step(learner: LearnerState, key: jax.Array) -> tuple[LearnerState, Mean]:
             batch = self._batch(state.replay, key)
-            return update(learner, batch, self._q_values, fold, self.optimizer, self.config)
+            return update(learner, batch, self._q_values, fold, optimizer, config)
 
         def learn(learner: LearnerState) -> tuple[LearnerState, Mean]:
             learner, losses = jax.lax.scan(step, learner, keys)

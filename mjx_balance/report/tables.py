@@ -35,6 +35,29 @@ def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
     return table
 
 
+def sweep_table(ranked: list[dict[str, Any]]) -> Table:
+    """One row per combination of swept values, in their order.
+
+    Args:
+      ranked: `values`, name -> value, and `statistics`, suite -> `statistics.over_seeds`, of each.
+    """
+    names = list(ranked[0]["values"])
+    table = _narrow("sweep, best first: falls, mean tilt in deg (95% interval over seeds)")
+    for name in (*names, "seeds"):
+        table.add_column(name, justify="right", no_wrap=True)
+    suites = list(ranked[0]["statistics"])
+    for suite in suites:
+        table.add_column(suite, justify="right", no_wrap=True)
+    for row in ranked:
+        found = [row["statistics"][suite] for suite in suites]
+        table.add_row(
+            *(f"{row['values'][name]:g}" for name in names),
+            str(found[0]["seeds"]),
+            *(f"{x['falls']}  {spread(x['mean'])}" for x in found),
+        )
+    return table
+
+
 def seeds_table(summary: dict[str, dict[str, Any]]) -> Table:
     """One row per suite, interquartile means over the training seeds.
 
@@ -77,8 +100,12 @@ def print_summary(
 
 def _suites_table(title: str) -> Table:
     """One row per suite, its name in the first column; narrow."""
-    table = Table(
-        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
-    )
+    table = _narrow(title)
     table.add_column("suite", style="bold", no_wrap=True)
     return table
+
+
+def _narrow(title: str) -> Table:
+    return Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )

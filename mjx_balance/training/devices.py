@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import psutil
 
-from mjx_balance.config import Config, ConfigError, check
+from mjx_balance.config import Config, ConfigError, check, combinations, members
 from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.engines.mujoco import cores
@@ -100,6 +100,8 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
     """The DQN for a config that `size_to_device` has completed."""
     assert config.num_envs is not None
     assert config.num_devices is not None
+    runs = members(config)
+    swept = combinations(config)[0]
     return Learner(
         env,
         QNetwork(config.dqn.hidden_sizes, network_branches(config), config.dqn.head == "radial"),
@@ -107,10 +109,11 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
         config.num_envs,
         config.num_env_steps,
         used_devices(config.num_devices),
-        config.num_seeds,
+        len(runs),
         env.symmetries,
         env.action_factors,
         env.reset_staggered,
+        {name: [getattr(own.dqn, name) for own in runs] for name in swept},
     )
 
 

@@ -3,11 +3,12 @@
 import json
 import shutil
 import time
+from typing import Any
 
 from tensorboardX import SummaryWriter
 
 from mjx_balance import evaluation
-from mjx_balance.config import Config, ConfigError
+from mjx_balance.config import Config, ConfigError, combinations, members
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.policy import Policy, PolicyError, load_policy, save_policy
@@ -67,10 +68,11 @@ def export(
       PolicyError: if no seed has a policy.
     """
     policies, files = [], []
+    several = len(members(config)) > 1
     for weights, manifest in exports(config, learner, scene_hash, state):
         manifest["training"]["seconds_learning_since_start_or_resume"] = round(seconds, 1)
         seed = manifest["config"]["seed"]
-        file = folder.policy if config.num_seeds == 1 else folder.seed_policy(seed)
+        file = folder.seed_policy(seed) if several else folder.policy
         best = best_validated(folder, seed, say) if config.export == "best" else None
         file.parent.mkdir(exist_ok=True)
         try:
@@ -87,7 +89,7 @@ def export(
         raise PolicyError(
             f"the run in {folder.path} learnt no policy of finite numbers; lower learning_rate"
         )
-    if config.num_seeds > 1:
+    if several:
         write_atomically(folder.policy, files[0].read_bytes())
     return policies
 
@@ -99,12 +101,16 @@ def finish(
 
     What says that the run is finished, `evaluation.json`, is written last.
     """
-    several = config.num_seeds > 1
+    several = len(members(config)) > 1
     scenarios, duration = config.eval_scenarios, config.eval_duration
     each = [
         _evaluate(policy, scenarios, duration, SEEDS.final, several, display) for policy in policies
     ]
     best = _choose(policies, each, duration, folder, display) if several else 0
+    if config.sweep:
+        ranked = _ranked(config, policies, each)
+        write_json(folder.sweep, ranked)
+        display.console.print(tables.sweep_table(ranked))
     results = each[best]
     _log(results, policies[best].manifest["training"]["env_steps"], folder)
     with display.phase("drawing figures"):
@@ -169,3 +175,26 @@ def _choose(
     display.say(f"best of the {len(policies)} seeds on the validation set: {seeds[best]}")
     display.console.print(tables.seeds_table(summary))
     return best
+
+
+def _ranked(config: Config, policies: list[Policy], each: list[Results]) -> list[dict[str, Any]]:
+    """What each combination of swept values has come to, the best first.
+
+    Fewer falls are better, then less mean tilt, added up over the suites.
+    """
+    rows = []
+    for number, values in enumerate(combinations(config)):
+        mine = [
+            results
+            for policy, results in zip(policies, each, strict=True)
+            if (policy.config.seed - config.seed) // config.num_seeds == number
+        ]
+        if mine:
+            statistics = {suite: over_seeds([x[suite] for x in mine]) for suite in HEADLINE}
+            rows.append({"values": values, "statistics": statistics})
+    return sorted(rows, key=_rank)
+
+
+def _rank(row: dict[str, Any]) -> tuple[int, float]:
+    found = row["statistics"].values()
+    return sum(x["falls"] for x in found), sum(x["mean"]["iqm"] for x in found)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from mjx_balance.config import Config
+from mjx_balance.config import Config, members
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import TrainState
 from mjx_balance.run_folder import RunFolder, keep_metrics_until, keep_validated_until
@@ -70,7 +70,7 @@ def make_plan(config: Config) -> Plan:
     per_call = iterations * config.num_envs
     return Plan(
         num_envs=config.num_envs,
-        num_seeds=config.num_seeds,
+        num_seeds=len(members(config)),
         iterations=iterations,
         total=-(-config.num_env_steps // per_call) * per_call,
         decision_s=config.task.ctrl_dt,

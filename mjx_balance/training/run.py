@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from mjx_balance.config import Config, ConfigError, check, flatten, to_dict
+from mjx_balance.config import Config, ConfigError, check, flatten, members, to_dict
 from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.env import BalanceEnv
@@ -168,7 +168,7 @@ def _open_folder(
             f"process {seen.index(False)} does not see {folder.path}; choose a folder that all "
             "machines share with --run-dir"
         )
-    last = config.seed + config.num_seeds - 1
+    last = config.seed + len(members(config)) - 1
     seeds = f"seed {last}" if last == config.seed else f"seeds {config.seed} to {last}"
     say(
         f"{folder.path}: preset {config.preset}, {seeds}, {config.num_envs} envs on "

@@ -5,7 +5,6 @@ from these files alone. A resumed run first drops those that are newer than its 
 validates again at the same decisions: it chooses as an undisturbed one does.
 """
 
-import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_balance.config import Config
+from mjx_balance.config import Config, members
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.dqn.updating import Params
 from mjx_balance.evaluation import observing, run_suite, summarize
@@ -70,9 +69,9 @@ def exports(
         "device": jax.devices()[0].device_kind,
         "date": time.strftime("%Y-%m-%d"),
     }
-    for k in range(config.num_seeds):
-        own = dataclasses.replace(config, seed=config.seed + k, num_seeds=1)
-        mine = jax.tree.map(lambda x: x[k], known) if config.num_seeds > 1 else known  # noqa: B023
+    runs = members(config)
+    for k, own in enumerate(runs):
+        mine = jax.tree.map(lambda x: x[k], known) if len(runs) > 1 else known  # noqa: B023
         yield jax.device_get(learner.exported(mine)), make_manifest(own, scene_hash, training)
 
 

@@ -11,6 +11,7 @@ import pytest
 from brax.envs.base import Env
 from jax.experimental.key_reuse import _core as key_reuse
 
+from mjx_balance.config import SWEEPABLE
 from mjx_balance.dqn import replay
 from mjx_balance.dqn.devices import AXIS
 from mjx_balance.dqn.learner import Learner, TrainState
@@ -21,13 +22,20 @@ ENVS, ITERATIONS = 8, 400
 
 
 def make(
-    env: Env, num_seeds: int = 1, devices: Any = None, num_envs: int = ENVS, **changes
+    env: Env,
+    num_seeds: int = 1,
+    devices: Any = None,
+    num_envs: int = ENVS,
+    sweep: Any = None,
+    **changes: Any,
 ) -> Learner:
     config = dataclasses.replace(CONFIG, **changes)
     network = QNetwork(config.hidden_sizes, (2,), config.head == "radial")
     symmetries = probes.PositiveState.symmetries if config.mirror else None
     total = num_envs * ITERATIONS
-    return Learner(env, network, config, num_envs, total, devices, num_seeds, symmetries)
+    return Learner(
+        env, network, config, num_envs, total, devices, num_seeds, symmetries, sweep=sweep
+    )
 
 
 def trained(learner: Learner, seed: int = 0) -> TrainState:
@@ -130,7 +138,7 @@ def test_no_key_is_used_twice(monkeypatch: pytest.MonkeyPatch) -> None:
         key_reuse.check_key_reuse_jaxpr(program.jaxpr)
         return shapes
 
-    state = check(learner.initial, jax.random.key(0))
+    state = check(lambda key: learner.initial(key, {}), jax.random.key(0))
     # JAX lets a key be folded again and again; fold_in(k, 1) is split(k)[1] all the same.
     once = key_reuse.KeyReuseSignature(key_reuse.Sink(0), key_reuse.Source(0))
     signatures = key_reuse.key_reuse_signatures
@@ -171,6 +179,60 @@ def test_several_seeds_are_as_many_runs(noisy: tuple[Learner, Any, Any]) -> None
         )
         np.testing.assert_array_equal(together.gradient_steps[k], alone.gradient_steps)
         assert metrics["loss"][k] == pytest.approx(float(alone_metrics["loss"]), rel=1e-3)
+
+
+SWEPT = {
+    "learning_rate": 1e-3,
+    "learning_rate_end_share": 0.5,
+    "gamma": 0.3,
+    "epsilon_start": 0.2,
+    "epsilon_end": 0.1,
+    "epsilon_decay_steps": 60,
+    "huber_delta": 0.1,
+    "max_grad_norm": 0.01,
+}
+"""None of them is what the probes' config has; without a delta, errors are squared: 1e9."""
+
+
+def test_a_sweep_is_as_many_runs_with_values_of_their_own() -> None:
+    """Runs of one seed: the last has all values, each other one lacks one of them.
+
+    The last is the run of a config that has these values. All others differ from it.
+    """
+    assert set(SWEPT) == set(SWEEPABLE)
+    usual = dataclasses.asdict(CONFIG) | {"huber_delta": 1e9}
+    columns = {
+        name: [usual[name] if name == other else value for other in (*SWEPT, None)]
+        for name, value in SWEPT.items()
+    }
+    learner, alone = (
+        Learner(
+            probes.TwoSteps(),
+            QNetwork((16,), (2,)),
+            dataclasses.replace(CONFIG, **own),
+            ENVS,
+            10 * ENVS,  # to the end of the schedules
+            jax.devices()[:1],
+            num_seeds,
+            sweep=sweep,
+        )
+        for own, num_seeds, sweep in (({}, len(SWEPT) + 1, columns), (SWEPT, 1, None))
+    )
+    start, swept = alone.init(3), learner.init(0).swept
+    same = jax.tree.map(lambda x: jnp.stack([x] * learner.num_seeds), start)
+    state, metrics = learner.train_program(10)(same._replace(swept=swept))
+    expected, expected_metrics = alone.train_program(10)(start)
+    found, wanted = jax.device_get((state.params, expected.params))
+    pairs = list(zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True))
+    off = np.max([np.abs(a - b).reshape(len(a), -1).max(axis=1) for a, b in pairs], axis=0)
+    assert off[-1] < 2e-6
+    assert (off[:-1] > 2e-5).all(), dict(zip(SWEPT, off, strict=False))
+    np.testing.assert_allclose(metrics["epsilon"][-1], expected_metrics["epsilon"], rtol=1e-5)
+
+
+def test_a_sweep_has_a_value_for_every_run() -> None:
+    with pytest.raises(ValueError, match="gamma has 2 values for 3 runs"):
+        make(probes.NoisyState(), num_seeds=3, sweep={"gamma": (0.1, 0.2)})
 
 
 def test_mirror_teaches_what_was_never_seen() -> None:

@@ -58,6 +58,21 @@ def test_seeds_table() -> None:
     assert corner == ["corner", "2", *cells]
 
 
+def test_sweep_table() -> None:
+    def row(gamma: float, rate: float, falls: int, mean: float) -> dict[str, Any]:
+        tilt = {"iqm": mean, "low": mean - 0.01, "high": mean + 0.02, "worst": 7.0}
+        statistics = {"seeds": 3, "falls": falls, "mean": tilt}
+        values = {"gamma": gamma, "learning_rate": rate}
+        return {"values": values, "statistics": {"paper": statistics, "corner": statistics}}
+
+    ranked = [row(0.1, 3e-3, 0, 0.08), row(0.4, 1e-5, 2, 0.2)]
+    title, heads, first, second = printed(tables.sweep_table(ranked))
+    assert " ".join(title).startswith("sweep, best first: falls, mean tilt in deg")
+    assert heads == "gamma learning_rate seeds paper corner".split()
+    assert first == "0.1 0.003 3 0 0.080 (0.070-0.100) 0 0.080 (0.070-0.100)".split()
+    assert second == "0.4 1e-05 3 2 0.200 (0.190-0.220) 2 0.200 (0.190-0.220)".split()
+
+
 def test_the_summary_names_every_file_of_the_run() -> None:
     out = io.StringIO()
     run = Path("runs/a[b]")

@@ -11,7 +11,6 @@ import psutil
 import pytest
 
 from mjx_balance.config import ConfigError, preset
-from mjx_balance.dqn import learner as learner_module
 from mjx_balance.env import BalanceEnv
 from mjx_balance.training import devices
 from mjx_balance.training.devices import check_memory, explained, make_learner, size_to_device
@@ -93,14 +92,7 @@ def test_a_replay_smaller_than_one_decision_of_all_envs_is_refused() -> None:
 @pytest.mark.parametrize(
     ("head", "factors"), [("joint", (441,)), ("factored", (21, 21)), ("radial", (21, 21))]
 )
-def test_the_learner_is_the_configs(
-    head: Any, factors: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lengths: list[int] = []
-    make = learner_module.make_optimizer
-    monkeypatch.setattr(
-        learner_module, "make_optimizer", lambda dqn, n: (lengths.append(n), make(dqn, n))[1]
-    )
+def test_the_learner_is_the_configs(head: Any, factors: tuple[int, ...]) -> None:
     dqn = dataclasses.replace(CONFIG.dqn, head=head, hidden_sizes=(8, 4), replay_ratio=512.0)
     config = dataclasses.replace(
         CONFIG, num_envs=32, num_devices=1, num_env_steps=320, num_seeds=3, dqn=dqn
@@ -116,7 +108,20 @@ def test_the_learner_is_the_configs(
     assert learner.symmetries is not None
     assert learner.first_reset == env.reset_staggered
     # 10 decisions of 32 envs, each transition replayed 512 times in batches of 256.
-    assert lengths == [640]
+    assert learner.total_updates == 640
+    assert learner.sweep == {}
+
+
+def test_a_sweep_is_told_to_the_learner() -> None:
+    config = with_batch(
+        512, num_envs=32, num_devices=1, num_seeds=2, sweep=("gamma=0,0.5", "huber_delta=1,2")
+    )
+    learner = make_learner(config, BalanceEnv(config))
+    assert learner.num_seeds == 8
+    assert {name: values.tolist() for name, values in learner.sweep.items()} == {
+        "gamma": [0, 0, 0, 0, 0.5, 0.5, 0.5, 0.5],
+        "huber_delta": [1, 1, 2, 2, 1, 1, 2, 2],
+    }
 
 
 MIB = 2**20

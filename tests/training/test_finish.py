@@ -128,9 +128,11 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return asked
 
 
-def finished(folder: RunFolder, *scales: float) -> dict[str, Any]:
+def finished(folder: RunFolder, *scales: float, sweep: tuple[str, ...] = ()) -> dict[str, Any]:
     policies, _ = export(folder, *scales)
     config = dataclasses.replace(CONFIG, num_seeds=len(scales), eval_scenarios=4, eval_duration=5.0)
+    if sweep:
+        config = dataclasses.replace(config, num_seeds=len(scales) // 2, sweep=sweep)
     display = Display(Console(file=io.StringIO(), width=200))
     return finish.finish(config, policies, folder, display, 0.0)
 
@@ -215,3 +217,27 @@ def test_a_run_killed_while_it_finishes_finishes_again(
             content = content[16 + length :]
     names = ["falls", *(f"tilt_{name}" for name in ("mean", "rms", "p50", "p95", "p99", "max"))]
     assert sorted(tags) == sorted(f"eval/{s}/{n}" for s in ("paper", "corner") for n in names)
+
+
+def test_a_sweep_is_ranked_by_falls_and_tilt_of_its_seeds(
+    folder: RunFolder, calls: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four runs: two values of gamma with two seeds each."""
+    monkeypatch.setitem(VALIDATION, SEED, (0, 0.9))
+    finished(folder, 1.0, 2.0, 3.0, 4.0, sweep=("gamma=0.1,0.4",))
+    best, worst = json.loads(folder.sweep.read_text())
+    assert [x["values"] for x in (best, worst)] == [{"gamma": 0.1}, {"gamma": 0.4}]
+    # All fall equally often in the evaluation; 1 - 0.9 and 1 - 0.4, and 1 - 0.1 and 1 - 0.6.
+    assert best["statistics"]["paper"]["mean"]["iqm"] == pytest.approx(0.35)
+    assert worst["statistics"]["corner"]["mean"]["iqm"] == pytest.approx(0.65)
+    assert best["statistics"]["corner"]["seeds"] == 2
+    assert best["statistics"]["corner"]["falls"] == 14
+
+
+def test_falls_rank_before_tilt() -> None:
+    def row(falls: tuple[int, int], tilt: float) -> Any:
+        suites = zip(("paper", "corner"), falls, strict=True)
+        return {"statistics": {s: {"falls": n, "mean": {"iqm": tilt}} for s, n in suites}}
+
+    rows = [row((0, 3), 0.1), row((1, 1), 0.5), row((2, 0), 0.4)]
+    assert sorted(rows, key=finish._rank) == [rows[2], rows[1], rows[0]]
