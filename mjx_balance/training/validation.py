@@ -63,6 +63,8 @@ def exports(
       state: of all seeds.
     """
     known = state._replace(env_state=None, replay=None)  # pyright: ignore[reportArgumentType]
+    if jax.process_count() > 1:  # the others do not take part: nothing of theirs may be touched
+        known = jax.tree.map(np.asarray, known)
     training = {
         "env_steps": number(state.env_steps),
         "gradient_steps": number(state.gradient_steps),
