@@ -318,7 +318,7 @@ PRESETS: Mapping[str, Config] = {
             push_period=2.5,
         ),
         # `default`'s smaller batches at a higher rate cost an eighth of `corner`'s mean tilt here.
-        # Nobody can foresee a kick: squared, its TD error drowns all others.
+        # Nobody can foresee a kick or a late action: squared, their TD errors drown all others.
         dqn=dataclasses.replace(
             _DQN,
             gamma=0.4,
