@@ -29,9 +29,9 @@ def mjx_engine(scene: Scene) -> Engine:
 
     @functools.cache
     def on_device() -> tuple[mjx.Model, mjx.Data]:
-        model = trained_model(scene)
+        model, own = trained_model(scene), jax.local_devices()[0]  # not another process's
         with jax.ensure_compile_time_eval():  # constants, though this runs inside a trace
-            return mjx.put_model(model), mjx.make_data(model)
+            return mjx.put_model(model, own), mjx.make_data(model, own)
 
     def advance(
         state: PhysicsState, ctrl: jax.Array, conditions: Conditions | None

@@ -81,12 +81,13 @@ def warp_engine(scene: Scene) -> Engine:
     @functools.cache
     def on_device(envs: int) -> tuple[mjx.Model, mjx.Data]:
         with jax.ensure_compile_time_eval():  # constants, though this runs inside a trace
-            model = mjx.put_model(plain, impl="warp")
+            own = jax.local_devices()[0]  # not another process's
+            model = mjx.put_model(plain, own, impl="warp")
             printed = model.opt._impl.warn_overflow & ~UNCONVERGED
             option = model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=printed))
             model = model.replace(opt=option)
             most = contacts * envs
-            return model, mjx.make_data(plain, impl="warp", naconmax=most, njmax=rows)
+            return model, mjx.make_data(plain, own, impl="warp", naconmax=most, njmax=rows)
 
     def physics(
         state: PhysicsState, ctrl: jax.Array, conditions: Conditions | None
