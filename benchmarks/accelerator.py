@@ -35,7 +35,7 @@ ENGINES = ("mjx", "warp", "mujoco")
 SIZES = (256, 2_048, 8_192, 32_768)
 THRESHOLDS = (0.2, 0.1)
 ROUNDS = 5
-DECISIONS_PER_CALL = 8_192
+DECISIONS_PER_CALL = {"cpu": 1_024, "gpu": 16_384}
 SHARES = {"rates": 0.16, "training": 0.1, "whole run": 0.2}
 """Most of the budget that one part may take."""
 
@@ -54,6 +54,13 @@ def sized(engine: Any, num_envs: int, preset_name: str) -> Any:
     config = devices.size_to_device(config)
     env = BalanceEnv(config)
     return config, devices.make_learner(config, env)
+
+
+def kind() -> str:
+    """Of the devices that JAX uses: a CPU's cores, or accelerators."""
+    import jax
+
+    return "cpu" if jax.devices()[0].platform == "cpu" else "gpu"
 
 
 def rates(engine: str, sizes: list[int]) -> None:
@@ -75,7 +82,7 @@ def rates(engine: str, sizes: list[int]) -> None:
         def act(obs: Any, network: Any = learner.network) -> Any:
             return network.apply({"params": params}, obs, method="head").greedy()
 
-        iterations = max(1, DECISIONS_PER_CALL // num_envs)
+        iterations = max(1, DECISIONS_PER_CALL[kind()] // num_envs)
         state = learner.init(0).env_state
         program, compile_s = compiled(env_program(learner, iterations, act), state)
         state, _ = program(state, jax.random.PRNGKey(0))
@@ -91,7 +98,7 @@ def rates(engine: str, sizes: list[int]) -> None:
 def training(engine: str, num_envs: int) -> None:
     """Prints a line of JSON."""
     config, learner = sized(engine, num_envs, "default")
-    iterations = max(1, DECISIONS_PER_CALL // num_envs)
+    iterations = max(1, DECISIONS_PER_CALL[kind()] // num_envs)
     state = learner.init(0)
     program, compile_s = compiled(learner.train_program(iterations), state)
     for _ in range(config.dqn.min_replay_size // (iterations * num_envs) + 1):
