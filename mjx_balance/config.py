@@ -414,7 +414,10 @@ def members(config: Config) -> list[Config]:
     """
     found = []
     for values in combinations(config):
-        whole = {k: int(v) if k == "epsilon_decay_steps" else v for k, v in values.items()}
+        whole = {
+            k: int(v) if k == "epsilon_decay_steps" and v.is_integer() else v
+            for k, v in values.items()
+        }
         dqn = dataclasses.replace(config.dqn, **whole)
         for _ in range(config.num_seeds):
             seed = config.seed + len(found)
@@ -429,8 +432,15 @@ def check(config: Config) -> Config:
         _check_fields(section)
     if config.preset not in PRESETS:
         preset(config.preset)
-    for own in members(config) if config.sweep else ():
-        _check_fields(own.dqn)
+    if config.sweep:
+        runs = members(config)
+        for own in runs:
+            _check_fields(own.dqn)
+        if len(runs) == 1:
+            raise ConfigError(
+                f"sweep is {shown(config.sweep)}, which is one run; give it more values, or set "
+                "num_seeds to 2 or more"
+            )
     if config.seed + len(combinations(config)) * config.num_seeds > 2**31:
         raise ConfigError(f"seed is {config.seed}; the last of all seeds must be less than 2**31")
     try:
