@@ -9,10 +9,9 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import jax
 import jax.numpy as jnp
 import optax
-from jax.flatten_util import ravel_pytree
 
 from mjx_balance.config import DQNConfig
-from mjx_balance.dqn.devices import AXIS
+from mjx_balance.dqn.devices import mean_over_devices
 from mjx_balance.dqn.heads import Head
 from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.replay import Transition
@@ -122,7 +121,7 @@ def update(
         return loss(fold(params), state.target_params, batch, q_values, config)
 
     value: jax.Array
-    value, grads = _mean_over_devices(jax.value_and_grad(whitened_loss)(state.params))
+    value, grads = mean_over_devices(jax.value_and_grad(whitened_loss)(state.params))
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
     gradient_steps = state.gradient_steps + 1
@@ -135,9 +134,3 @@ def update(
     made = LearnerState(params, target_params, opt_state, gradient_steps)
     kept = jax.tree.map(lambda new, old: jnp.where(sound, new, old), made, state)
     return kept, Mean(jnp.where(sound, value, 0.0), sound.astype(jnp.float32))
-
-
-def _mean_over_devices(tree: Any) -> Any:
-    """One exchange for all arrays: each that there is makes the devices wait for each other."""
-    flat, unflatten = ravel_pytree(tree)
-    return unflatten(jax.lax.pmean(flat, AXIS))
