@@ -2,8 +2,8 @@
 
 One command of at most eight minutes, for a GPU or without one:
   rates      physics steps per second of every engine, robots on their feet under a trained policy;
-  training   the whole program of preset `default` at the engine's best number of envs, and its
-             share of that engine's own rate;
+  training   the whole program of preset `default`, sized as a run on this device is, and its share
+             of the best of these rates; on an accelerator, runs are sized by them from now on;
   whole run  `train.py` with the fastest engine, started twice (cold, then warm): seconds from the
              start of the process to a validation below 0.2 and 0.1 deg without a fall in both
              headline suites, and the held-out evaluation of what comes out.
@@ -14,10 +14,12 @@ said, and leaves the others alone.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import importlib.metadata
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -40,14 +42,14 @@ SHARES = {"rates": 0.16, "training": 0.1, "whole run": 0.2}
 """Most of the budget that one part may take."""
 
 
-def sized(engine: Any, num_envs: int, preset_name: str) -> Any:
-    """Env and learner of a preset; or of the shipped policy, for the preset `policy`."""
+def sized(engine: Any, num_envs: int | None) -> Any:
+    """Config and learner of the shipped policy; of preset `default` if a run is to choose."""
     from mjx_balance.config import preset
     from mjx_balance.env import BalanceEnv
     from mjx_balance.policy import load_policy
     from mjx_balance.training import devices
 
-    config = load_policy(POLICY).config if preset_name == "policy" else preset(preset_name)
+    config = load_policy(POLICY).config if num_envs else preset("default")
     config = dataclasses.replace(
         config, engine=engine, num_envs=num_envs, num_devices=None, num_seeds=1
     )
@@ -69,7 +71,10 @@ def rates(engine: str, sizes: list[int]) -> None:
     import jax.numpy as jnp
     from safetensors.numpy import load_file
 
+    from mjx_balance.training import devices
+
     params: dict[str, Any] = {}
+    found: dict[int, float] = {}
     for name, value in load_file(POLICY).items():
         layer, _, part = name.partition("/")
         if part:
@@ -77,7 +82,7 @@ def rates(engine: str, sizes: list[int]) -> None:
         else:
             params[layer] = jnp.asarray(value)
     for num_envs in sizes:
-        config, learner = sized(engine, num_envs, "policy")
+        config, learner = sized(engine, num_envs)
 
         def act(obs: Any, network: Any = learner.network) -> Any:
             return network.apply({"params": params}, obs, method="head").greedy()
@@ -92,12 +97,16 @@ def rates(engine: str, sizes: list[int]) -> None:
             seconds.append(took)
         steps = iterations * num_envs * config.task.sim_steps
         tilt = float(jnp.mean(state.metrics["tilt_deg"]))
-        say(num_envs, steps / sorted(seconds)[ROUNDS // 2], compile_s, mean_tilt_deg=tilt)
+        found[num_envs] = steps / sorted(seconds)[ROUNDS // 2]
+        say(num_envs, found[num_envs], compile_s, mean_tilt_deg=tilt)
+        if kind() == "gpu":
+            devices.remember_envs(engine, found)
 
 
-def training(engine: str, num_envs: int) -> None:
+def training(engine: str) -> None:
     """Prints a line of JSON."""
-    config, learner = sized(engine, num_envs, "default")
+    config, learner = sized(engine, None)
+    num_envs = learner.num_envs
     iterations = max(1, DECISIONS_PER_CALL[kind()] // num_envs)
     state = learner.init(0)
     program, compile_s = compiled(learner.train_program(iterations), state)
@@ -168,16 +177,22 @@ class Parts:
 
     def run(self, engine: str, num_envs: int, start: str, work: Path) -> dict[str, Any] | None:
         """A whole `train.py`; none if it did not end well or in time."""
+        from mjx_balance.training.devices import SIZES_FILE
+        from mjx_balance.training.program_cache import cache_dir
+
         name, seconds = f"whole run, {engine}, {start}", self.left("whole run")
         print(f"{name} ...", file=sys.stderr, flush=True)
         folder = work / start
-        flags = (
-            f"--engine {engine} --num-envs {num_envs} --eval-every 2048 --log-every 2048".split()
-        )
+        often = str(8 * num_envs)  # 20 times in a run
+        cache = work / "cache"  # empty, but for what the rates say of this device
+        cache.mkdir(exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copy(cache_dir() / SIZES_FILE, cache)
+        flags = ["--engine", engine, "--eval-every", often, "--log-every", often]
         began = time.monotonic()
         process = subprocess.Popen(
             [sys.executable, str(REPO / "train.py"), *flags, "--run-dir", str(folder)],
-            env=environment(engine) | {"MJX_BALANCE_CACHE": str(work / "cache")},
+            env=environment(engine) | {"MJX_BALANCE_CACHE": str(cache)},
             stdout=sys.stderr,
         )
         reached: dict[float, float] = {}
@@ -246,14 +261,15 @@ def measure(budget: float, sizes: list[int], engines: list[str]) -> dict[str, An
             best[engine] = max(rows, key=lambda row: row["physics_steps_per_second"])
     ranked = sorted(best, key=lambda engine: -best[engine]["physics_steps_per_second"])
     for engine in ranked:
-        for row in parts.lines("training", engine, "--sizes", str(best[engine]["num_envs"])):
+        for row in parts.lines("training", engine):
             share = row["physics_steps_per_second"] / best[engine]["physics_steps_per_second"]
             found["training"].append({"engine": engine, "share_of_rate": share} | row)
+    fastest = max(found["training"], key=lambda row: row["physics_steps_per_second"], default=None)
     with tempfile.TemporaryDirectory() as work:
         runs = [
-            parts.run(ranked[0], min(best[ranked[0]]["num_envs"], 2_048), start, Path(work))
+            parts.run(fastest["engine"], fastest["num_envs"], start, Path(work))
             for start in ("cold", "warm")
-            if ranked
+            if fastest is not None
         ]
     found["runs"] = [run for run in runs if run is not None]
     return found | {"failures": parts.failures, "seconds": time.monotonic() - parts.began}
@@ -339,7 +355,7 @@ def main() -> None:
         if args.part == "rates":
             rates(args.engine, args.sizes)
         else:
-            training(args.engine, args.sizes[0])
+            training(args.engine)
         return
     found = measure(args.budget, args.sizes, args.engines)
     if args.json:

@@ -77,6 +77,7 @@ def child(place: Any, engine: Any, num_envs: int, batches: int, rounds: int) -> 
                 check_vma=False,
             )
         )
+        us.gather(None)  # the first exchange waits half a minute, and compiling may take longer
         jax.block_until_ready(alone(gradients))
         for _ in range(config.dqn.min_replay_size // (iterations * num_envs) + 2):
             state, _ = jax.block_until_ready(program(state))
@@ -116,7 +117,9 @@ def run(count: int, engine: str, num_envs: int, batches: int, rounds: int) -> di
     said = [process.communicate()[0] for process in children]
     if any(process.returncode for process in children):
         raise SystemExit(f"{engine}, {count} processes: one of them failed")
-    return json.loads(next(x for x in said[0].splitlines() if x.startswith("{")))
+    row = json.loads(next(x for x in said[0].splitlines() if x.startswith("{")))
+    print(f"  {row}", file=sys.stderr, flush=True)
+    return row
 
 
 def predicted(row: dict[str, Any], one: dict[str, Any], kind: str) -> float:

@@ -267,8 +267,10 @@ class Learner:
         count = jax.lax.psum(sound.sum(), AXIS)
         mean: jax.Array = jax.lax.psum(jnp.where(sound, obs, 0.0).sum(axis=0), AXIS) / count
         away = jnp.where(sound, obs - mean, 0.0)
-        covariance = jax.lax.psum(away.T @ away, AXIS) / count
-        seen = whitening.update(state.inputs, mean, covariance, self.config.whiten_floor)
+        # What neighbouring samples differ in is little, and is what whitening divides by.
+        with jax.default_matmul_precision("highest"):
+            covariance = jax.lax.psum(away.T @ away, AXIS) / count
+            seen = whitening.update(state.inputs, mean, covariance, self.config.whiten_floor)
         usable = finite(seen)  # not if no observation was, or their squares are beyond numbers
         return jax.tree.map(lambda new, old: jnp.where(usable, new, old), seen, state.inputs)
 

@@ -2,26 +2,54 @@
 
 import contextlib
 import dataclasses
+import json
 import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import psutil
+from jax.sharding import PartitionSpec
 
-from mjx_balance.config import Config, ConfigError, check, combinations, members
-from mjx_balance.dqn.learner import Learner
+from mjx_balance.config import (
+    Config,
+    ConfigError,
+    check,
+    combinations,
+    flatten,
+    members,
+    preset,
+    to_dict,
+)
+from mjx_balance.dqn.learner import REPLICATED, Learner
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.engines.mujoco import cores
 from mjx_balance.env import BalanceEnv
 from mjx_balance.policy import network_branches
-from mjx_balance.training.program_cache import Say, enable_compilation_cache
+from mjx_balance.run_folder import write_json
+from mjx_balance.training.program_cache import Say, cache_dir, enable_compilation_cache
 
+SIZES_FILE = "sizes.json"
+"""In the cache: numbers of envs by device and engine, as measured."""
+NEAR_BEST = 0.9
+"""Share of the best rate from which on more envs are not worth their memory and their batches."""
 STATE_COPIES = 2
 """A checkpoint is read back beside the state that it replaces."""
+ENV_BYTES = 40_000
+"""Of each env while MJX steps it: twice what XLA plans for on a CPU, which fuses more."""
 PROGRAM_BYTES = 1.3 * 2**30
-"""Memory of a run besides its state: libraries, compiler, program (benchmarks/README.md)."""
+"""Memory of a run besides: libraries, compiler, program (benchmarks/README.md)."""
 CPU_ENVS = 256
-ACCELERATOR_ENVS = 2048
+"""What the sizes of presets without `num_envs` are meant for."""
+ACCELERATOR_ENVS = 2_048
+"""Of an accelerator that has not been measured."""
+COUNTED_IN_ENVS = ("num_env_steps", "log_every", "eval_every")
+LEARNER_COUNTED_IN_ENVS = (
+    *("batch_size", "replay_capacity", "min_replay_size", "epsilon_decay_steps", "whiten_steps"),
+)
+"""Sizes that grow with the number of envs, so that a run keeps its decisions of each env and its
+updates, each with more transitions: the replay ratio stays."""
 
 
 def configure_jax(say: Say) -> None:
@@ -32,8 +60,12 @@ def configure_jax(say: Say) -> None:
     enable_compilation_cache(say)
 
 
-def size_to_device(config: Config) -> Config:
-    """Fills in what the config leaves to the device.
+def size_to_device(config: Config, most: int | None = None) -> Config:
+    """Fills in what the config leaves to the device; what it says stays.
+
+    Args:
+      config: of a run.
+      most: envs to choose, for want of memory.
 
     Raises:
       ConfigError: if the envs cannot be spread over that many devices.
@@ -50,9 +82,11 @@ def size_to_device(config: Config) -> Config:
             f"engine is warp, which runs on NVIDIA GPUs and CPUs, and JAX uses "
             f"{available[0].device_kind}; choose engine mjx"
         )
+    if config.num_envs is None:
+        wanted = CPU_ENVS if on_cpu else measured_envs(config.engine) or ACCELERATOR_ENVS
+        config = widened(config, min(wanted, most or wanted))
     num_envs, batch_size = config.num_envs, config.dqn.batch_size
-    if num_envs is None:
-        num_envs = CPU_ENVS if on_cpu else ACCELERATOR_ENVS
+    assert num_envs is not None
     num_devices, processes = config.num_devices, jax.process_count()
     if num_devices is None:
         num_devices = _even_share(len(available), processes, num_envs, batch_size)
@@ -69,8 +103,71 @@ def size_to_device(config: Config) -> Config:
             raise ConfigError(
                 f"{name} is {value}; it must be a multiple of num_devices, {num_devices}"
             )
-    sized = dataclasses.replace(config, num_envs=num_envs, num_devices=num_devices)
-    return check(sized)
+    return check(dataclasses.replace(config, num_devices=num_devices))
+
+
+def widened(config: Config, num_envs: int) -> Config:
+    """The config with so many envs, and as much more of everything that it does not say itself.
+
+    That is every size that is still its preset's.
+    """
+    usual, scale = preset(config.preset), num_envs / CPU_ENVS
+
+    def more(own: Any, usual: Any, names: Sequence[str]) -> dict[str, int]:
+        values = {name: getattr(own, name) for name in names}
+        kept = {name: x for name, x in values.items() if x == getattr(usual, name)}
+        return {name: round(scale * x) for name, x in kept.items()}
+
+    learner = more(config.dqn, usual.dqn, LEARNER_COUNTED_IN_ENVS)
+    own = more(config, usual, COUNTED_IN_ENVS)
+    dqn = dataclasses.replace(config.dqn, **learner)
+    return dataclasses.replace(config, num_envs=num_envs, dqn=dqn, **own)
+
+
+def grown(wanted: Config, sized: Config) -> list[str]:
+    """What to tell the user of sizes that follow from the device: a line, or none."""
+    before, after = flatten(to_dict(wanted)), flatten(to_dict(sized))
+    names = (*COUNTED_IN_ENVS, *LEARNER_COUNTED_IN_ENVS)
+    changed = [f"{name} {after[name]:,}" for name in names if after[name] != before[name]]
+    if not changed:
+        return []
+    return [f"with num_envs {sized.num_envs:,} come {', '.join(changed)}; what you say stays"]
+
+
+def measured_envs(engine: str) -> int | None:
+    """The number of envs that was found best for this device; none if nobody measured it."""
+    try:
+        found = json.loads(_measured_sizes().read_text())[_device(engine)]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+    return found if isinstance(found, int) and found > 0 else None
+
+
+def remember_envs(engine: str, rates: Mapping[int, float]) -> int:
+    """Keeps the number of envs to size runs on this device by: the fewest that come near the best.
+
+    Args:
+      engine: that was measured.
+      rates: number of envs -> physics steps per second.
+    """
+    enough = NEAR_BEST * max(rates.values())
+    chosen = min(num_envs for num_envs, rate in rates.items() if rate >= enough)
+    path = _measured_sizes()
+    try:
+        known = json.loads(path.read_text())
+    except (OSError, ValueError):
+        known = {}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, known | {_device(engine): chosen})
+    return chosen
+
+
+def _measured_sizes() -> Path:
+    return cache_dir() / SIZES_FILE
+
+
+def _device(engine: str) -> str:
+    return f"{jax.devices()[0].device_kind}, engine {engine}"
 
 
 def _even_share(available: int, processes: int, *counts: int) -> int:
@@ -118,26 +215,41 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
 
 
 def check_memory(learner: Learner) -> None:
-    """Refuses a state that would not fit, before anything is allocated.
+    """Refuses a run that would not fit into a device or into this machine, before it allocates.
 
     Raises:
       ConfigError: with the estimate.
     """
-    shapes = jax.eval_shape(lambda: learner.init(0))
-    state = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes))
-    needed = STATE_COPIES * state + PROGRAM_BYTES
+    needed = device_bytes(learner)
     device = learner.mesh.devices.ravel()[0]
     if device.platform == "cpu":
+        mine = [x for x in learner.mesh.devices.ravel() if x.process_index == jax.process_index()]
+        where, needed = "this machine", len(mine) * needed
         available = psutil.virtual_memory().available
     else:
-        needed /= learner.num_devices
-        available = (device.memory_stats() or {}).get("bytes_limit", math.inf)
+        where, stats = "each device", device.memory_stats() or {}
+        available = stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)
+    needed += PROGRAM_BYTES
     if needed > available:
         raise ConfigError(
-            f"num_seeds is {learner.num_seeds}, num_envs {learner.num_envs} and replay_capacity "
-            f"{learner.config.replay_capacity}: that takes about {needed / 2**30:.1f} GiB, and "
-            f"{available / 2**30:.1f} GiB are free; lower one of them"
+            f"{learner.num_seeds} runs with num_envs {learner.num_envs} and replay_capacity "
+            f"{learner.config.replay_capacity} take about {needed / 2**30:.1f} GiB of {where}, and "
+            f"{available / 2**30:.1f} GiB are free; lower num_envs, replay_capacity or the number "
+            "of runs"
         )
+
+
+def device_bytes(learner: Learner) -> float:
+    """Memory that a run takes on each of its devices, besides its program."""
+    shapes = jax.eval_shape(lambda: learner.init(0))
+
+    def own(spec: PartitionSpec, part: Any) -> float:
+        whole = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(part))
+        return whole if spec == REPLICATED else whole / learner.num_devices
+
+    state = sum(jax.tree.leaves(jax.tree.map(own, learner.specs, shapes)))
+    envs = learner.num_seeds * learner.num_envs / learner.num_devices
+    return STATE_COPIES * state + ENV_BYTES * envs
 
 
 def explained(error: Exception) -> str | None:

@@ -83,6 +83,8 @@ def train(
         devices.configure_jax(display.say)
         wanted = config
         config, env, learner = processes.everywhere(lambda: _make(wanted), ConfigError)
+        for line in devices.grown(wanted, config):
+            display.say(line)
         folder = _open_folder(config, provenance(env), run_dir, resume, display.say, processes)
         with _locked(folder, processes), _resumable(folder):
             with loop.Interrupts(display.say) as stop:
@@ -115,12 +117,19 @@ def train(
 
 def _make(config: Config) -> tuple[Config, BalanceEnv, Learner]:
     """The config, sized to the devices, its env and its learner, which fit into the memory."""
-    config = devices.size_to_device(check(config))
-    finish.check_fits(config)
-    env = BalanceEnv(config)
-    learner = devices.make_learner(config, env)
-    devices.check_memory(learner)
-    return config, env, learner
+    most = None
+    while True:
+        sized = devices.size_to_device(check(config), most)
+        finish.check_fits(sized)
+        env = BalanceEnv(sized)
+        learner = devices.make_learner(sized, env)
+        try:
+            devices.check_memory(learner)
+            return sized, env, learner
+        except ConfigError:
+            if config.num_envs is not None or learner.num_envs <= devices.CPU_ENVS:
+                raise
+            most = learner.num_envs // 2
 
 
 def provenance(env: BalanceEnv) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import types
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,10 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import psutil
 import pytest
+from jax.sharding import PartitionSpec
 
 from mjx_balance.config import ConfigError, preset
+from mjx_balance.dqn.devices import AXIS
+from mjx_balance.dqn.learner import REPLICATED
 from mjx_balance.env import BalanceEnv
-from mjx_balance.training import devices
+from mjx_balance.training import devices, program_cache, run
 from mjx_balance.training.devices import check_memory, explained, make_learner, size_to_device
 
 CONFIG = preset("default")
@@ -30,10 +34,70 @@ def test_a_cpu_gets_256_envs_over_both_cores() -> None:
     assert dataclasses.replace(sized, num_envs=None, num_devices=None) == CONFIG
 
 
-def test_an_accelerator_gets_2048(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jax, "devices", lambda: [types.SimpleNamespace(platform="gpu")])
+@pytest.fixture
+def on_h100(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """One GPU that nobody has measured."""
+    device = types.SimpleNamespace(platform="gpu", device_kind="NVIDIA H100")
+    monkeypatch.setattr(jax, "devices", lambda: [device])
+    monkeypatch.setenv("MJX_BALANCE_CACHE", str(tmp_path))
+
+
+@pytest.mark.usefixtures("on_h100")
+def test_an_accelerator_gets_2048_envs_and_eight_times_of_what_is_counted_in_them() -> None:
+    """The replay ratio, the updates of a run and the decisions of an env are the laptop's."""
     sized = size_to_device(CONFIG)
     assert (sized.num_envs, sized.num_devices) == (2048, 1)
+    assert (sized.num_env_steps, sized.log_every, sized.eval_every) == (320_000, 8_192, 160_000)
+    dqn = sized.dqn
+    assert (dqn.batch_size, dqn.replay_capacity, dqn.min_replay_size) == (2048, 1_048_576, 8_192)
+    assert (dqn.epsilon_decay_steps, dqn.whiten_steps) == (40_000, 400_000)
+    assert dqn.updates_per_step(2048) == CONFIG.dqn.updates_per_step(256) == 32
+    same = dataclasses.replace(
+        sized,
+        **{name: getattr(CONFIG, name) for name in (*devices.COUNTED_IN_ENVS, "num_devices")},
+        num_envs=None,
+        dqn=CONFIG.dqn,
+    )
+    assert same == CONFIG, "nothing else"
+    assert devices.grown(CONFIG, sized) == [
+        "with num_envs 2,048 come num_env_steps 320,000, log_every 8,192, eval_every 160,000, "
+        "batch_size 2,048, replay_capacity 1,048,576, min_replay_size 8,192, "
+        "epsilon_decay_steps 40,000, whiten_steps 400,000; what you say stays"
+    ]
+
+
+@pytest.mark.usefixtures("on_h100")
+def test_what_the_user_says_is_not_grown() -> None:
+    dqn = dataclasses.replace(CONFIG.dqn, batch_size=1_024, epsilon_decay_steps=7_000)
+    said = dataclasses.replace(CONFIG, num_env_steps=50_000, dqn=dqn)
+    sized = size_to_device(said)
+    assert (sized.num_env_steps, sized.log_every) == (50_000, 8_192)
+    assert (sized.dqn.batch_size, sized.dqn.epsilon_decay_steps) == (1_024, 7_000)
+    assert sized.dqn.updates_per_step(2048) == 64
+    with_envs = dataclasses.replace(CONFIG, num_envs=2_048)
+    assert size_to_device(with_envs) == dataclasses.replace(with_envs, num_devices=1)
+    assert devices.grown(with_envs, size_to_device(with_envs)) == []
+
+
+@pytest.mark.usefixtures("on_h100")
+def test_a_measured_device_gets_the_fewest_envs_that_come_near_the_best() -> None:
+    """Of the engine that was measured; what is damaged counts as nothing."""
+    rates = {256: 0.5e6, 1_024: 1.9e6, 4_096: 4.6e6, 8_192: 4.9e6, 32_768: 5.0e6}
+    assert devices.remember_envs("mjx", rates) == 4_096
+    assert devices.remember_envs("warp", {256: 1e6}) == 256
+    assert size_to_device(CONFIG).num_envs == 4_096
+    assert size_to_device(dataclasses.replace(CONFIG, engine="warp")).num_envs == 256
+    for text in ("{", "[]", '{"NVIDIA H100, engine mjx": "many"}'):
+        (program_cache.cache_dir() / "sizes.json").write_text(text)
+        assert size_to_device(CONFIG).num_envs == 2_048
+
+
+def test_a_cpu_is_not_sized_by_a_measurement(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MJX_BALANCE_CACHE", str(tmp_path))
+    devices.remember_envs("mjx", {8_192: 1.0})
+    assert size_to_device(CONFIG).num_envs == 256
 
 
 def test_the_c_engine_is_refused_where_jax_has_no_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,53 +192,96 @@ MIB = 2**20
 
 
 class Learner:
-    """With a state of 3 MiB on a device of some kind."""
+    """8 MiB that every device has, and 4 MiB shared out; 2 runs of 64 envs."""
 
     num_seeds, num_envs = 2, 64
     config = CONFIG.dqn
 
-    def __init__(self, device: Any, num_devices: int = 1) -> None:
-        self.mesh = types.SimpleNamespace(devices=np.asarray([device] * num_devices))
-        self.num_devices = num_devices
+    def __init__(self, *devices: Any) -> None:
+        self.specs = {"parameters": REPLICATED, "replay": PartitionSpec(None, AXIS)}
+        self.mesh = types.SimpleNamespace(devices=np.asarray(devices))
+        self.num_devices = len(devices)
 
     def init(self, seed: int) -> Any:
-        return {"a": jnp.zeros((MIB // 2,), jnp.float32), "b": jnp.zeros((MIB,), jnp.int8)}
+        rows = {"a": jnp.zeros((MIB // 2,), jnp.float32), "b": jnp.zeros((2 * MIB,), jnp.int8)}
+        return {"parameters": jnp.zeros(2 * MIB), "replay": rows}
 
 
-def cpu() -> Any:
-    return types.SimpleNamespace(platform="cpu")
+def cpu(process_index: int = 0) -> Any:
+    return types.SimpleNamespace(platform="cpu", process_index=process_index)
 
 
 def gpu(limit: int | None) -> Any:
-    stats = None if limit is None else {"bytes_limit": limit}
+    stats = None if limit is None else {"bytes_limit": limit, "bytes_in_use": 7 * MIB}
     return types.SimpleNamespace(platform="gpu", memory_stats=lambda: stats)
 
 
+@pytest.fixture
 def needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """100 MiB of libraries, and 1 MiB per env and device."""
     monkeypatch.setattr(devices, "PROGRAM_BYTES", 100 * MIB)
+    monkeypatch.setattr(devices, "ENV_BYTES", MIB)
 
 
-def test_a_state_must_fit_twice_beside_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    needs(monkeypatch)
-    free = [106 * MIB]
+@pytest.mark.usefixtures("needs")
+@pytest.mark.parametrize(
+    ("mesh", "least"),
+    [
+        ((cpu(),), 100 + 2 * (8 + 4) + 128),
+        ((cpu(), cpu()), 100 + 2 * 2 * (8 + 2) + 128),
+        ((cpu(), cpu(1)), 100 + 2 * (8 + 2) + 64),
+    ],
+    ids=("one device", "two", "two of which one is another process's"),
+)
+def test_a_machine_must_hold_twice_what_its_own_devices_have(
+    mesh: Any, least: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = [least * MIB]
     memory = lambda: types.SimpleNamespace(available=free[0])  # noqa: E731
     monkeypatch.setattr(psutil, "virtual_memory", memory)
-    learner: Any = Learner(cpu())
+    learner: Any = Learner(*mesh)
     check_memory(learner)
     free[0] -= 1
-    with pytest.raises(ConfigError, match="num_seeds is 2, num_envs 64 and replay_capacity 131072"):
+    with pytest.raises(ConfigError) as refused:
         check_memory(learner)
+    assert str(refused.value) == (
+        "2 runs with num_envs 64 and replay_capacity 131072 take about "
+        f"{least / 1024:.1f} GiB of this machine, and {least / 1024:.1f} GiB are free; lower "
+        "num_envs, replay_capacity or the number of runs"
+    )
 
 
-def test_every_accelerator_takes_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    needs(monkeypatch)
-    fits: Any = Learner(gpu(53 * MIB), num_devices=2)
+@pytest.mark.usefixtures("needs")
+def test_every_accelerator_takes_its_share_of_what_is_free() -> None:
+    least = 100 + 2 * (8 + 2) + 64 + 7
+    fits: Any = Learner(gpu(least * MIB), gpu(least * MIB))
     check_memory(fits)
-    too_much: Any = Learner(gpu(52 * MIB), num_devices=2)
-    with pytest.raises(ConfigError, match=r"takes about 0\.1 GiB, and 0\.1 GiB are free"):
+    too_much: Any = Learner(gpu(least * MIB - 1), gpu(least * MIB - 1))
+    with pytest.raises(ConfigError, match=r"take about 0\.2 GiB of each device, and 0\.2 GiB are"):
         check_memory(too_much)
     unknown: Any = Learner(gpu(None))
     check_memory(unknown)
+
+
+@pytest.mark.usefixtures("on_h100")
+def test_envs_that_nobody_asked_for_are_halved_until_they_fit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """2,048 for 64 runs are too many here; 512 that somebody asked for are refused."""
+
+    def check(learner: Any) -> None:
+        if learner.num_envs > 300:
+            raise ConfigError("too much")
+
+    monkeypatch.setattr(devices, "make_learner", lambda config, env: config)
+    monkeypatch.setattr(devices, "check_memory", check)
+    sized, *_ = run._make(CONFIG)
+    assert (sized.num_envs, sized.num_env_steps, sized.dqn.batch_size) == (256, 40_000, 256)
+    with pytest.raises(ConfigError, match="too much"):
+        run._make(dataclasses.replace(CONFIG, num_envs=512))
+    monkeypatch.setattr(devices, "CPU_ENVS", 512)
+    with pytest.raises(ConfigError, match="too much"):
+        run._make(CONFIG)
 
 
 def test_errors_of_a_running_program_are_explained_where_they_can_be() -> None:
