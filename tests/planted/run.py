@@ -137,6 +137,8 @@ def run_pytest(where: Path, tests: str, witness: Path) -> None:
         sys.path.insert(0, str(where))
         os.environ |= {"PYTHONPATH": str(where), "PYTHONDONTWRITEBYTECODE": "1"}
         sys.dont_write_bytecode = True
+        # Of the pool's worker that this is a fork of: it would forbid tests to start processes.
+        multiprocessing.current_process()._config.pop("daemon", None)  # pyright: ignore
         code = pytest.main(
             ["-x", "-q", "-p", "no:cacheprovider", *tests.split()], [Witness(witness)]
         )

@@ -8,12 +8,18 @@ import socket
 import subprocess
 import sys
 import time
+import unittest.mock
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
+from mujoco import mjx
 
-from mjx_balance import load_policy
+from mjx_balance import BalanceEnv, load_policy
 from mjx_balance.run_folder import RunFolder
 from mjx_balance.training.checkpoints import saved_steps
 
@@ -141,6 +147,27 @@ def test_a_killed_and_a_stopped_process_lose_nothing(
     code, said = end(start(cache, "--resume", str(folder.path)))
     assert code == 0, said
     assert fingerprint(folder) == fingerprint(alone)
+
+
+def traced(index: int, address: str) -> int:
+    """Shapes of a decision of MJX, in one of two processes; the device that the model lies on."""
+    jax.config.update("jax_num_cpu_devices", 1)
+    jax.distributed.initialize(address, 2, index)
+    env = BalanceEnv()
+    with unittest.mock.patch("mujoco.mjx.put_model", wraps=mjx.put_model) as put:
+        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+        jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((), jnp.int32))
+    ((_, device), _), *_ = put.call_args_list
+    jax.distributed.shutdown()
+    return device.process_index
+
+
+def test_every_process_has_mjxs_model_on_a_device_of_its_own() -> None:
+    """MJX puts it on the first device of all, which is process 0's."""
+    with socket.create_server(("", 0)) as server:
+        address = f"localhost:{server.getsockname()[1]}"
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        assert list(pool.map(traced, (0, 1), (address, address))) == [0, 1]
 
 
 def test_processes_that_were_started_differently_all_say_so(cache: Path, tmp_path: Path) -> None:
