@@ -12,13 +12,11 @@ import tyro
 from rich.console import Console
 
 from mjx_balance.config import Config, ConfigError, preset
+from mjx_balance.exit_codes import FAILED, INTERRUPTED, USAGE_ERROR
 from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.run_folder import RunFolderError, read_run_config
 
-FAILED = 1
-USAGE_ERROR = 2
-INTERRUPTED = 130
 COMMANDS = ("train", "sweep", "evaluate", "report")
 
 
@@ -234,7 +232,7 @@ def _video(scene, controller, args: EvaluateArgs) -> int:
         render.write(args.video, scene.config, rollout.qpos[0])
     except render.RenderError as error:
         print(f"mjx-balance: no video written: {error}", file=sys.stderr)
-        return 1
+        return FAILED
     print(f"video of the first scenario: {args.video}")
     return 0
 

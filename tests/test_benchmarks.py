@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from flax import linen as nn
 
 from mjx_balance.config import DQNConfig, TaskConfig
 from mjx_balance.controllers import View
@@ -489,3 +490,47 @@ def test_what_a_machine_gave_is_written_down_with_what_failed(
     )
     assert "- warp: warp-lang is not installed" in text
     assert text.endswith("300 s in all.")
+
+
+def test_the_efficiency_that_exchanges_alone_would_leave(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1,000 decisions of each of two take 1 s of work; 2,000 in all come with 2,000 u exchanges."""
+    predicted = load("scaling", monkeypatch).predicted
+    one = {"decisions_per_second": 1_000.0}
+    for kind, updates, seconds in (("weak", 1 / 16, 1.25), ("strong", 1 / 8, 1.5)):
+        row = {"updates_per_decision": updates, "exchange_s": 2e-3}
+        assert predicted(row, one, kind) == pytest.approx(1 / seconds)
+
+
+def test_hosts_at_which_exchanges_take_half_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An update per 56 ms; 100,000 bits take 100 us of 1 Gbit/s beside 900 of the message."""
+    module = load("scaling", monkeypatch)
+    monkeypatch.setattr(module, "MESSAGE_S", {1: 900e-6})
+    monkeypatch.setattr(module, "NETWORKS_GBIT", (1,))
+    one = {"decisions_per_second": 100 / 5.6, "updates_per_decision": 1.0, "gradient_bytes": 12_500}
+    *_, row = module.arithmetic(one)
+    # 57 hosts: 56 messages of 1 ms. 8 that update 8 times as often: 7 messages in 7 ms.
+    assert row == "| 1 Gbit/s | 1,000 us | 7,000 us | 63,000 us | 57 | 8 |"
+
+
+@pytest.mark.parametrize(("name", "bits"), [("TF32", 10), ("bfloat16", 7)])
+def test_products_are_rounded_forward_and_backward(
+    name: str, bits: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A factor of 1 + 2^-bits survives, half a bit more is lost; sums are not rounded."""
+    module = load("precision", monkeypatch)
+    assert module.MANTISSA[name] == bits
+    kept, lost = 1 + 2.0**-bits, 1 + 2.0**-bits * 1.25
+    layer = nn.Dense(1, use_bias=False)
+    x = jnp.asarray([lost, 2.0**-12])
+
+    def value(kernel: jax.Array, x: jax.Array) -> jax.Array:
+        return jnp.asarray(layer.apply({"params": {"kernel": kernel}}, x))[0] * lost
+
+    kernel = jnp.asarray([[1.0], [1.0]])
+    with module.with_products_of(bits):
+        by_kernel, by_x = jax.grad(value, (0, 1))(kernel, x)
+        whole = value(kernel, x)
+    assert float(whole) == np.float32(np.float32(kept + 2.0**-12) * np.float32(lost))
+    np.testing.assert_array_equal(by_kernel[:, 0], (kept * kept, 2.0**-12 * kept))
+    np.testing.assert_array_equal(by_x, (kept, kept))
+    assert float(value(kernel, x)) != float(whole)

@@ -54,8 +54,11 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (("--max-incline", "12"), "max_incline is 12.0 deg"),
         (("--num-envs", "0"), "num_envs is 0"),
         (("--num-seeds", "0"), "num_seeds is 0"),
-        (("--num-seeds", "100000", "--num-envs", "64"), "num_seeds is 100000, num_envs 64 and"),
-        (("--replay-capacity", "4000000000"), "replay_capacity 4000000000: that takes about"),
+        (
+            ("--num-seeds", "100000", "--num-envs", "64"),
+            "100000 runs with num_envs 64 and replay_capacity",
+        ),
+        (("--replay-capacity", "4000000000"), "replay_capacity 4000000000 take about"),
         (("--seed", "4294967296"), "seed is 4294967296"),
         (("--reward-tilt", "sideways"), "--reward-tilt"),
         (("--payload", "-1"), "payload is -1.0"),

@@ -10,7 +10,7 @@ import mjx_balance
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
-    ("quiet", "sources", "robots.record"),
+    ("exit_codes", "quiet", "sources", "robots.record"),
     ("robots.quadruped",),
     ("robots",),
     ("config",),
@@ -47,8 +47,8 @@ FLOORS = (
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
-    "robots config quiet sources task scene model_fields suites policy run_folder controllers "
-    "evaluation statistics render report display".split()
+    "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
+    "controllers evaluation statistics render report display".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}

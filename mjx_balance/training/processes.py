@@ -22,14 +22,14 @@ from typing import Any, NoReturn, TypeVar, cast
 
 import jax
 
+from mjx_balance.exit_codes import FAILED, INTERRUPTED
+
 T = TypeVar("T")
 
 PATIENCE_S = 300.0
 """Time in which all processes must have come: as long as `jax.distributed` gives them."""
 SILENCE_S = 30
 """Time after which a machine that answers nothing counts as gone."""
-FAILED = 1
-INTERRUPTED = 130
 
 
 class ProcessError(ValueError):

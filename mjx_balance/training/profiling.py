@@ -26,6 +26,10 @@ EXCHANGES = ("psum", "pmin", "pmax", "all_gather")
 OTHER, EXCHANGE, HOST = "other", "exchange", "host"
 SKIPPED = 3
 """Calls before the one that is looked at: until then there are no updates yet."""
+TOO_SHORT = (
+    f"--profile traces call {SKIPPED + 1} of the training program, and the run ended before it; "
+    "raise num_env_steps, or lower log_every"
+)
 
 
 class Event(NamedTuple):
@@ -55,6 +59,11 @@ class Profiled:
         """
         self._program, self._folder, self._done = program, folder, done
         self._calls = 0
+
+    @property
+    def begun(self) -> bool:
+        """Whether a call has been traced."""
+        return self._calls > SKIPPED
 
     def __call__(self, state: Any) -> tuple[Any, Any]:
         self._calls += 1

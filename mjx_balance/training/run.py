@@ -222,7 +222,10 @@ def _learn(
                 shown = functools.partial(_shown, display, folder)
                 program = profiling.Profiled(program, folder.profile, shown)
     processes.gather(None)  # whoever compiles longest is awaited here, where nothing times out
-    return loop.learn(plan, program, state, folder, display, stop, validate, processes)
+    learnt = loop.learn(plan, program, state, folder, display, stop, validate, processes)
+    if profile and not (isinstance(program, profiling.Profiled) and program.begun):
+        display.say(profiling.TOO_SHORT)
+    return learnt
 
 
 def _shown(display: Display, folder: RunFolder, shares: Mapping[str, float]) -> None:

@@ -9,27 +9,33 @@ import subprocess
 import sys
 import time
 import unittest.mock
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import pytest
 from mujoco import mjx
+from runs import end, start, wait
 
 from mjx_balance import BalanceEnv, load_policy
 from mjx_balance.run_folder import RunFolder
 from mjx_balance.training.checkpoints import saved_steps
 
-REPO = Path(__file__).parents[2]
+Process: TypeAlias = subprocess.Popen[str]
 FLAGS = (
     "--preset smoke --engine mujoco --num-devices 2 --num-env-steps 4096 --eval-every 0 "
     "--eval-scenarios 4 --eval-duration 5 --checkpoint-seconds 0.5"
 ).split()
-PATIENCE_S = 300.0
-STARTED: list[subprocess.Popen[str]] = []
+
+
+class StartTwo(Protocol):
+    """Starts two processes of a run."""
+
+    def __call__(self, *flags: str, seeds: tuple[int, int] = (0, 0)) -> list[Process]: ...
 
 
 @pytest.fixture(scope="module")
@@ -37,46 +43,22 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
-@pytest.fixture(autouse=True)
-def nobody_is_left() -> Iterator[None]:
-    yield
-    for process in STARTED:
+@pytest.fixture
+def start_two(cache: Path) -> Iterator[StartTwo]:
+    """None of them is left."""
+    started: list[Process] = []
+
+    def begin(*flags: str, seeds: tuple[int, int] = (0, 0)) -> list[Process]:
+        with socket.create_server(("", 0)) as server:
+            address = f"localhost:{server.getsockname()[1]}"
+        place = ["--coordinator", address, "--num-processes", "2", "--process-id"]
+        for k, seed in enumerate(seeds):
+            started.append(start(cache, *flags, *place, str(k), "--seed", str(seed)))
+        return started[-2:]
+
+    yield begin
+    for process in started:
         process.kill()
-
-
-def start(cache: Path, *flags: str) -> subprocess.Popen[str]:
-    process = subprocess.Popen(
-        [sys.executable, str(REPO / "train.py"), *flags],
-        env=os.environ | {"MJX_BALANCE_CACHE": str(cache)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    STARTED.append(process)
-    return process
-
-
-def start_two(cache: Path, *flags: str, seeds: tuple[int, int] = (0, 0)) -> list[subprocess.Popen]:
-    with socket.create_server(("", 0)) as server:
-        place = ["--coordinator", f"localhost:{server.getsockname()[1]}", "--num-processes", "2"]
-    return [
-        start(cache, *flags, *place, "--process-id", str(k), "--seed", str(seed))
-        for k, seed in enumerate(seeds)
-    ]
-
-
-def end(process: subprocess.Popen[str]) -> tuple[int, str]:
-    """Exit code and what was said, but for gloo's own line."""
-    said, _ = process.communicate(timeout=PATIENCE_S)
-    lines = [line for line in said.splitlines() if not line.startswith("[Gloo]")]
-    return process.returncode, "\n".join(lines)
-
-
-def wait(when: Callable[[], object]) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not when():
-        assert time.monotonic() < until
-        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")
@@ -97,12 +79,12 @@ def fingerprint(folder: RunFolder) -> str:
 
 
 def test_two_processes_make_the_run_of_one_with_two_devices(
-    alone: RunFolder, cache: Path, tmp_path: Path
+    alone: RunFolder, start_two: StartTwo, tmp_path: Path
 ) -> None:
     """To the bit: each steps its 32 boards, and the sums of two gradients are the same."""
     folder = RunFolder(tmp_path / "run")
     (code, said), (other_code, other_said) = map(
-        end, start_two(cache, *FLAGS, "--run-dir", str(folder.path))
+        end, start_two(*FLAGS, "--run-dir", str(folder.path))
     )
     assert (code, other_code) == (0, 0), said + other_said
     assert "64 envs on 2 cpu device" in said
@@ -114,12 +96,12 @@ def test_two_processes_make_the_run_of_one_with_two_devices(
 
 
 def test_a_killed_and_a_stopped_process_lose_nothing(
-    alone: RunFolder, cache: Path, tmp_path: Path
+    alone: RunFolder, start_two: StartTwo, cache: Path, tmp_path: Path
 ) -> None:
     """Kill -9 of the second, SIGTERM to the second, then on in one process with two devices."""
     folder = RunFolder(tmp_path / "run")
-    first, second = start_two(cache, *FLAGS, "--run-dir", str(folder.path))
-    wait(lambda: saved_steps(folder.checkpoints) or first.poll() is not None)
+    first, second = start_two(*FLAGS, "--run-dir", str(folder.path))
+    wait(first, lambda: saved_steps(folder.checkpoints))
     if sys.platform == "linux":  # gloo's thread interrupts no other one
         assert os.sched_getscheduler(second.pid) == os.SCHED_BATCH
     second.kill()
@@ -134,8 +116,8 @@ def test_a_killed_and_a_stopped_process_lose_nothing(
 
     saved = max(saved_steps(folder.checkpoints))
     boards = len(list(folder.tensorboard.iterdir()))
-    first, second = start_two(cache, "--resume", str(folder.path))
-    wait(lambda: len(list(folder.tensorboard.iterdir())) > boards or first.poll() is not None)
+    first, second = start_two("--resume", str(folder.path))
+    wait(first, lambda: len(list(folder.tensorboard.iterdir())) > boards)
     second.send_signal(signal.SIGTERM)
     (code, said), (other_code, other_said) = map(end, (first, second))
     assert (code, other_code) == (130, 130), said + other_said
@@ -170,9 +152,11 @@ def test_every_process_has_mjxs_model_on_a_device_of_its_own() -> None:
         assert list(pool.map(traced, (0, 1), (address, address))) == [0, 1]
 
 
-def test_processes_that_were_started_differently_all_say_so(cache: Path, tmp_path: Path) -> None:
+def test_processes_that_were_started_differently_all_say_so(
+    start_two: StartTwo, tmp_path: Path
+) -> None:
     flags = (*FLAGS, "--run-dir", str(tmp_path / "run"))
-    for code, said in map(end, start_two(cache, *flags, seeds=(3, 4))):
+    for code, said in map(end, start_two(*flags, seeds=(3, 4))):
         assert code == 2, said
         assert said == (
             "mjx-balance: process 1 has seed = 4, process 0 has 3; start all with the same flags "

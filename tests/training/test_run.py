@@ -5,25 +5,20 @@ import os
 import re
 import signal
 import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
+from runs import end, interrupt, start
 
 from mjx_balance import load_policy
 from mjx_balance.run_folder import RunFolder
 from mjx_balance.training.checkpoints import saved_steps
 
-REPO = Path(__file__).parents[2]
 FLAGS = (
     "--preset smoke --engine mujoco --num-env-steps 6144 --eval-scenarios 8 --eval-duration 10 "
     "--checkpoint-seconds 1"
 ).split()
-PATIENCE_S = 300.0
 
 
 @pytest.fixture(scope="module")
@@ -34,39 +29,6 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def cores() -> int:
     return os.cpu_count() or 1
-
-
-class Done(NamedTuple):
-    """What became of a process."""
-
-    code: int
-    said: str
-
-
-def start(cache: Path, *flags: str) -> subprocess.Popen[str]:
-    environment = os.environ | {"MJX_BALANCE_CACHE": str(cache)}
-    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # JAX, imported here, has set it
-    return subprocess.Popen(
-        [sys.executable, str(REPO / "train.py"), *flags],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def end(process: subprocess.Popen[str]) -> Done:
-    said, _ = process.communicate(timeout=PATIENCE_S)
-    return Done(process.returncode, said)
-
-
-def interrupt(process: subprocess.Popen[str], number: int, when: Callable[[], object]) -> Done:
-    """Sends a signal as soon as something is the case."""
-    until = time.monotonic() + PATIENCE_S
-    while not when() and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.02)
-    process.send_signal(number)
-    return end(process)
 
 
 @pytest.fixture(scope="module")
