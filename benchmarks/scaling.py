@@ -189,9 +189,9 @@ def main() -> None:
     columns = "engine scaling processes boards decisions/s efficiency predicted exchange".split()
     note = (
         f"{machine['cpu']}, {machine['cores']} cores, a core per process, preset default with "
-        f"{fastest['updates_per_decision']:.3f} updates per decision (weak: half as many of twice the "
-        f"size) of {fastest['gradient_bytes']:,.0f} bytes of gradients; medians of {args.repeats} runs of "
-        f"{args.rounds} calls; efficiency against the one process, and what it would be if "
+        f"{fastest['updates_per_decision']:.3f} updates per decision (weak: half as many of twice "
+        f"the size) of {fastest['gradient_bytes']:,.0f} bytes of gradients; medians of "
+        f"{args.repeats} runs of {args.rounds} calls; efficiency against the one process, and what it would be if "
         "processes lost nothing but their exchanges."
     )
     publish("scaling", [*table(columns, rows), "", note, "", *arithmetic(fastest)], args.write)
