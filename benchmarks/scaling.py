@@ -191,8 +191,8 @@ def main() -> None:
         f"{machine['cpu']}, {machine['cores']} cores, a core per process, preset default with "
         f"{fastest['updates_per_decision']:.3f} updates per decision (weak: half as many of twice "
         f"the size) of {fastest['gradient_bytes']:,.0f} bytes of gradients; medians of "
-        f"{args.repeats} runs of {args.rounds} calls; efficiency against the one process, and what it would be if "
-        "processes lost nothing but their exchanges."
+        f"{args.repeats} runs of {args.rounds} calls; efficiency against the one process, and what "
+        "it would be if processes lost nothing but their exchanges."
     )
     publish("scaling", [*table(columns, rows), "", note, "", *arithmetic(fastest)], args.write)
 
