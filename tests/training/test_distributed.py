@@ -58,7 +58,8 @@ def start_two(cache: Path) -> Iterator[StartTwo]:
 
     yield begin
     for process in started:
-        process.kill()
+        with process:
+            process.kill()
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ def test_an_operation_belongs_to_the_innermost_of_our_names() -> None:
 
 def test_what_runs_within_an_operation_is_not_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two threads of one device: 0 to 100 ns, in which two run that hold one another."""
-    outer, inner = Event("while.3", 0, 60), Event("fusion.12", 10, 30)
+    outer, inner = Event("while.3", 0, 60), Event("fusion.12", 0, 30)
     innermost, after = Event("copy.4", 15, 5), Event("fusion.12", 60, 10)
     other_thread = Event("all-reduce.1", 80, 20)
     timelines = [[after, inner, outer, innermost], [other_thread]]
