@@ -5,7 +5,6 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -136,10 +135,7 @@ def grown(wanted: Config, sized: Config) -> list[str]:
 
 def measured_envs(engine: str) -> int | None:
     """The number of envs that was found best for this device; none if nobody measured it."""
-    try:
-        found = json.loads(_measured_sizes().read_text())[_device(engine)]
-    except (OSError, ValueError, LookupError, TypeError):
-        return None
+    found = _measured_sizes().get(_device(engine))
     return found if isinstance(found, int) and found > 0 else None
 
 
@@ -152,18 +148,19 @@ def remember_envs(engine: str, rates: Mapping[int, float]) -> int:
     """
     enough = NEAR_BEST * max(rates.values())
     chosen = min(num_envs for num_envs, rate in rates.items() if rate >= enough)
-    path = _measured_sizes()
-    try:
-        known = json.loads(path.read_text())
-    except (OSError, ValueError):
-        known = {}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, known | {_device(engine): chosen})
+    known = _measured_sizes()
+    cache_dir().mkdir(parents=True, exist_ok=True)
+    write_json(cache_dir() / SIZES_FILE, known | {_device(engine): chosen})
     return chosen
 
 
-def _measured_sizes() -> Path:
-    return cache_dir() / SIZES_FILE
+def _measured_sizes() -> dict[str, Any]:
+    """By device and engine; nothing if the file is missing or damaged."""
+    try:
+        known = json.loads((cache_dir() / SIZES_FILE).read_text())
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}
 
 
 def _device(engine: str) -> str:

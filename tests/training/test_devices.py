@@ -90,6 +90,8 @@ def test_a_measured_device_gets_the_fewest_envs_that_come_near_the_best() -> Non
     for text in ("{", "[]", '{"NVIDIA H100, engine mjx": "many"}'):
         (program_cache.cache_dir() / "sizes.json").write_text(text)
         assert size_to_device(CONFIG).num_envs == 2_048
+        assert devices.remember_envs("warp", {1_024: 1e6}) == 1_024
+        assert size_to_device(dataclasses.replace(CONFIG, engine="warp")).num_envs == 1_024
 
 
 def test_a_cpu_is_not_sized_by_a_measurement(
