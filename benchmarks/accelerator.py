@@ -20,6 +20,7 @@ import importlib.metadata
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -169,9 +170,8 @@ class Parts:
         timer.start()
         out, errors = process.communicate()
         if process.returncode:
-            last = ([x for x in errors.splitlines() if x.strip()] or ["nothing said"])[-1]
-            reason = f"stopped after {seconds:.0f} s" if not timer.is_alive() else last[:200]
-            self.failures.append(f"{name}: {reason}")
+            stopped = None if timer.is_alive() else f"stopped after {seconds:.0f} s"
+            self.failures.append(f"{name}: {stopped or why(process.returncode, errors)}")
         timer.cancel()
         return [json.loads(x) for x in out.splitlines() if x.startswith("{")]
 
@@ -216,6 +216,13 @@ class Parts:
             for suite, result in json.loads(results.read_text()).items()
         }
         return {"start": start, "engine": engine, "reached_s": reached, "evaluation": evaluation}
+
+
+def why(code: int, errors: str) -> str:
+    """Why a part ended: by its signal, or else its last line."""
+    if code < 0:
+        return f"ended by {signal.Signals(-code).name}"
+    return ([x for x in errors.splitlines() if x.strip()] or [f"exit code {code}"])[-1][:200]
 
 
 def environment(engine: str) -> dict[str, str]:

@@ -47,7 +47,7 @@ def child(place: Any, engine: Any, num_envs: int, batches: int, rounds: int) -> 
     from jax.flatten_util import ravel_pytree
 
     from mjx_balance.config import preset
-    from mjx_balance.dqn.devices import mean_over_devices
+    from mjx_balance.dqn.devices import mean_over_devices, on_each_device
     from mjx_balance.dqn.learner import REPLICATED
     from mjx_balance.env import BalanceEnv
     from mjx_balance.training import devices, processes
@@ -69,13 +69,7 @@ def child(place: Any, engine: Any, num_envs: int, batches: int, rounds: int) -> 
             return jax.lax.scan(step, x, length=EXCHANGES)[0]
 
         alone = jax.jit(
-            jax.shard_map(
-                exchange,
-                mesh=learner.mesh,
-                in_specs=REPLICATED,
-                out_specs=REPLICATED,
-                check_vma=False,
-            )
+            on_each_device(exchange, learner.mesh, in_specs=REPLICATED, out_specs=REPLICATED)
         )
         us.gather(None)  # the first exchange waits half a minute, and compiling may take longer
         jax.block_until_ready(alone(gradients))

@@ -99,7 +99,7 @@ def env_program(learner, iterations: int, act: Callable[..., Any] | None = None)
     import jax.numpy as jnp
 
     from mjx_balance.dqn.collecting import reset_done
-    from mjx_balance.dqn.devices import device_key
+    from mjx_balance.dqn.devices import device_key, on_each_device
     from mjx_balance.dqn.learner import REPLICATED
 
     env = learner.env
@@ -117,12 +117,11 @@ def env_program(learner, iterations: int, act: Callable[..., Any] | None = None)
 
     sharded = learner.specs.env_state
     return jax.jit(
-        jax.shard_map(
+        on_each_device(
             program,
-            mesh=learner.mesh,
+            learner.mesh,
             in_specs=(sharded, REPLICATED),
             out_specs=(sharded, REPLICATED),
-            check_vma=False,
         )
     )
 

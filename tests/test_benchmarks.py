@@ -5,6 +5,7 @@ import importlib.util
 import itertools
 import json
 import runpy
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -490,6 +491,15 @@ def test_what_a_machine_gave_is_written_down_with_what_failed(
     )
     assert "- warp: warp-lang is not installed" in text
     assert text.endswith("300 s in all.")
+
+
+def test_why_a_part_of_a_benchmark_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    why = load("accelerator", monkeypatch).why
+    crash = "import sys, os; print('warning', file=sys.stderr); os.kill(os.getpid(), 11)"
+    ended = subprocess.run([sys.executable, "-c", crash], capture_output=True, text=True)
+    assert why(ended.returncode, ended.stderr) == "ended by SIGSEGV"
+    assert why(1, "Traceback\nMemoryError: 8 GiB\n\n") == "MemoryError: 8 GiB"
+    assert why(3, "") == "exit code 3"
 
 
 def test_the_efficiency_that_exchanges_alone_would_leave(monkeypatch: pytest.MonkeyPatch) -> None:

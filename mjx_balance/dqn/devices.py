@@ -1,12 +1,24 @@
 """The one mesh axis of the program, seen from inside: one device among the others."""
 
-from typing import TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh
 
 AXIS = "devices"
 T = TypeVar("T")
+
+
+def on_each_device(
+    function: Callable[..., Any], mesh: Mesh, in_specs: Any, out_specs: Any
+) -> Callable[..., Any]:
+    """What runs `function` on every device of the mesh; see `jax.shard_map`."""
+    # Jitted, its constants stay inside it: over an empty one (the indices of `x.at[:].set`) among
+    # the operands, Shardy of JAX 0.11 crashes on two CPU devices.
+    inner = jax.jit(function, inline=True)
+    return jax.shard_map(inner, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
 
 def device_key(key: jax.Array) -> jax.Array:

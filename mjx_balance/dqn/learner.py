@@ -25,7 +25,7 @@ from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import replay, whitening
 from mjx_balance.dqn.acting import epsilon, explore
 from mjx_balance.dqn.collecting import Collected, Reset, array, collect, finite, fresh
-from mjx_balance.dqn.devices import AXIS, device_key
+from mjx_balance.dqn.devices import AXIS, device_key, on_each_device
 from mjx_balance.dqn.heads import Head
 from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.networks import QNetwork
@@ -148,12 +148,11 @@ class Learner:
     @cached_property
     def _init_program(self) -> Callable[[np.ndarray, Mapping[str, np.ndarray]], TrainState]:
         return jax.jit(
-            jax.shard_map(
+            on_each_device(
                 self._each_seed(lambda seed, swept: self.initial(jax.random.PRNGKey(seed), swept)),
-                mesh=self.mesh,
+                self.mesh,
                 in_specs=REPLICATED,
                 out_specs=self.specs,
-                check_vma=False,
             )
         )
 
@@ -182,12 +181,8 @@ class Learner:
             return state, {name: mean.value() for name, mean in totals.items()}
 
         return jax.jit(
-            jax.shard_map(
-                program,
-                mesh=self.mesh,
-                in_specs=(self.specs,),
-                out_specs=(self.specs, REPLICATED),
-                check_vma=False,
+            on_each_device(
+                program, self.mesh, in_specs=(self.specs,), out_specs=(self.specs, REPLICATED)
             ),
             donate_argnums=0,
         )
