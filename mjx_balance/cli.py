@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from mjx_balance.config import Config, ConfigError, preset
+from mjx_balance.config import Config, ConfigError, fitted, preset
 from mjx_balance.exit_codes import FAILED, INTERRUPTED, USAGE_ERROR
 from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
@@ -50,6 +50,8 @@ class EvaluateArgs:
     """Policy file."""
     controller: str | None = None
     """Baseline to evaluate instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
+    robot: str | None = None
+    """Robot of the baseline; of a policy, where its robot's file is now."""
     suite: str = "paper"
     """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast or
     steep."""
@@ -111,12 +113,13 @@ def _sweep(argv: list[str]) -> int:
 
 def _train(argv: list[str]) -> int:
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--preset")
+    early.add_argument("--preset", default="default")
+    early.add_argument("--robot", default="quadruped")
     early.add_argument("--resume", type=Path)
     known, _ = early.parse_known_args(argv)
     try:
         if known.resume is None:
-            default = TrainArgs(config=preset(known.preset or "default"))
+            default = TrainArgs(config=fitted(preset(known.preset), known.robot))
         else:
             default = TrainArgs(config=read_run_config(known.resume))
     except ValueError as error:
@@ -187,11 +190,11 @@ def _evaluate(argv: list[str]) -> int:
             return _complain("name a policy file or --controller NAME, one of the two")
         if args.policy is not None:
             policy = load_policy(args.policy)
-            scene = evaluation.policy_scene(policy)
+            scene = evaluation.policy_scene(policy, robot=args.robot)
             controller = evaluation.observing(policy)
         else:
             assert args.controller is not None
-            scene = load_scene(preset("default"))
+            scene = load_scene(fitted(preset("default"), args.robot or "quadruped"))
             controller = make_controller(args.controller, scene)
         with display.bar(f"evaluating, suite {args.suite}") as bar:
             rollout = evaluation.run_suite(
@@ -212,6 +215,8 @@ def _evaluate(argv: list[str]) -> int:
         if args.video:
             return _video(scene, controller, args)
     except (PolicyError, evaluation.EvaluationError, SuiteError, ControllerError) as error:
+        return _complain(str(error))
+    except ConfigError as error:
         return _complain(str(error))
     except OSError as error:
         return _complain(f"cannot write {error.filename}: {error.strerror}")

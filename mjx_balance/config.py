@@ -262,7 +262,7 @@ class Config:
     """Physics of the training: MJX, on any device; MuJoCo's C engine, on CPUs; or MJX-Warp, on
     NVIDIA GPUs, whose steps do not repeat bit for bit."""
     robot: str = "quadruped"
-    """The robot (robots/)."""
+    """The robot: a shipped one's name, a TOML file that describes yours, or menagerie:NAME."""
     solver_iterations: int = bounded(4, least=1, most=1_000)
     """Newton iterations of a physics step of engines `mjx` and `warp`; `mujoco` goes on until it
     has converged. A batch waits for its slowest env, but fewer do not converge when a random policy
@@ -369,11 +369,46 @@ def preset(name: str) -> Config:
     return PRESETS[name]
 
 
+def fitted(config: Config, robot: str) -> Config:
+    """`config`, of our own robot, for another: what depends on mass and size goes along.
+
+    Standing height and greatest height change are the robot's own (`robots.building`). Angles, the
+    board's rate and the fall limit stay the paper's.
+
+    Raises:
+      ConfigError: if there is no such robot.
+    """
+    try:
+        found = find_robot(robot)
+    except RobotError as error:
+        raise ConfigError(str(error)) from error
+    task = dataclasses.replace(
+        config.task,
+        body_height=found.body_height,
+        action_max=found.action_max,
+        height_scale=config.task.height_scale * found.size_scale,
+    )
+    ranges = scaled_to(config.randomization, found)
+    return dataclasses.replace(config, robot=robot, task=task, randomization=ranges)
+
+
+def scaled_to(ranges: RandomizationConfig, robot: Robot) -> RandomizationConfig:
+    """Loads by the robot's mass, their places and the kicks' speeds by its size."""
+    return dataclasses.replace(
+        ranges,
+        payload=ranges.payload * robot.mass_scale,
+        payload_offset=ranges.payload_offset * robot.size_scale,
+        payload_height=ranges.payload_height * robot.size_scale,
+        push_min=ranges.push_min * robot.size_scale,
+        push_max=ranges.push_max * robot.size_scale,
+    )
+
+
 def greatest_incline(task: TaskConfig, robot: Robot) -> float:
     """Board angle on both axes at once that the legs' stroke can follow, deg."""
     lowest, highest = robot.height_range
     room = min(highest - task.body_height, task.body_height - lowest)
-    return math.degrees(math.atan(room / (robot.hip_x + robot.half_track)))
+    return math.degrees(math.atan(room / (robot.half_length + robot.half_track)))
 
 
 SWEEPABLE = (
@@ -426,8 +461,13 @@ def members(config: Config) -> list[Config]:
     return found
 
 
-def check(config: Config) -> Config:
-    """Returns `config` if it can be run; raises `ConfigError` with one sentence if not."""
+def check(config: Config, robot: Robot | None = None) -> Config:
+    """Returns `config` if it can be run; raises `ConfigError` with one sentence if not.
+
+    Args:
+      config: what is asked for.
+      robot: what `config.robot` names, if that is known already.
+    """
     for section in (config, config.task, config.randomization, config.dqn):
         _check_fields(section)
     if config.preset not in PRESETS:
@@ -444,7 +484,7 @@ def check(config: Config) -> Config:
     if config.seed + len(combinations(config)) * config.num_seeds > 2**31:
         raise ConfigError(f"seed is {config.seed}; the last of all seeds must be less than 2**31")
     try:
-        robot = find_robot(config.robot)
+        robot = robot or find_robot(config.robot)
     except RobotError as error:
         raise ConfigError(str(error)) from error
     _check_timing(config.task)

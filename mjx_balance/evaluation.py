@@ -17,6 +17,7 @@ from mjx_balance.config import RandomizationConfig, TaskConfig, greatest_incline
 from mjx_balance.controllers import Controller, View
 from mjx_balance.engines.mujoco import Motion, MujocoEngine
 from mjx_balance.policy import Policy, PolicyError
+from mjx_balance.robots import RobotError, find_robot
 from mjx_balance.scene import Scene, load_scene
 from mjx_balance.suites import authority, find_suite, make_pushes, make_scenarios
 from mjx_balance.task import decision, tilt
@@ -242,13 +243,30 @@ def settled_action(rollout: Rollout) -> float | None:
     return None if np.isnan(values).all() else float(np.nanmean(values))
 
 
-def policy_scene(policy: Policy, visual: bool = False) -> Scene:
+def policy_scene(policy: Policy, visual: bool = False, robot: str | None = None) -> Scene:
     """Builds the scene a policy was trained in.
 
+    Args:
+      policy: says which.
+      visual: as `build_model`.
+      robot: what its robot is called here; as in training if none.
+
     Raises:
-      PolicyError: if today's scene files or engine give another one.
+      PolicyError: if the robot is not here, is another one, or today's scene files or engine
+        give another scene.
     """
-    scene = load_scene(policy.config, visual)
+    name = robot or policy.config.robot
+    try:
+        found = find_robot(name)
+    except RobotError as error:
+        raise PolicyError(f"the policy's robot is {policy.robot.name!r}, but {error}") from error
+    if found != policy.robot:
+        raise PolicyError(
+            f"the policy was trained for robot {policy.robot.name!r} "
+            f"({policy.robot.total_mass:.1f} kg), and {name} is another one "
+            f"({found.total_mass:.1f} kg, or legs or servos that differ)"
+        )
+    scene = load_scene(dataclasses.replace(policy.config, robot=name), visual)
     if scene.hash != policy.scene_hash:
         raise PolicyError(
             f"the policy was trained in scene {policy.scene_hash}, but scenes/ now gives "

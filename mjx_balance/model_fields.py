@@ -15,7 +15,8 @@ from mjx_balance.task.randomization import Conditions
 def model_fields(scene: Scene, conditions: Conditions) -> dict[str, Array]:
     """The model's fields in given circumstances, for `mjx.Model.replace` or `Batch.expand`.
 
-    The payload is a point mass; its products of inertia are left out.
+    The payload is a point mass; its products of inertia about the trunk's principal axes are
+    left out.
 
     Args:
       scene: the nominal model.
@@ -29,7 +30,7 @@ def model_fields(scene: Scene, conditions: Conditions) -> dict[str, Array]:
     load, at = conditions.payload[..., None], conditions.payload_at
     mass, centre = model.body_mass[trunk], model.body_ipos[trunk]
     moved = (mass * centre + load * at) / (mass + load)
-    arm = at - centre
+    arm = (at - centre) @ _principal(model, trunk)
     spread = xp.sum(arm**2, axis=-1, keepdims=True) - arm**2
     inertia = model.body_inertia[trunk] + mass * load / (mass + load) * spread
     gain = conditions.gain[..., None]
@@ -57,6 +58,13 @@ def model_fields(scene: Scene, conditions: Conditions) -> dict[str, Array]:
     }
 
 
+def _principal(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """(3, 3) a body's principal axes, as columns, in its frame."""
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[body])
+    return axes.reshape(3, 3)
+
+
 @dataclasses.dataclass(frozen=True)
 class _AtRest:
     """Jacobians and inertia of the nominal model at qpos0."""
@@ -68,6 +76,8 @@ class _AtRest:
     """(nbody, 3, nv) of the bodies' centres of mass; the trunk's: of its frame's origin."""
     turns: np.ndarray
     """(nbody, 3, nv) rotational."""
+    trunk_turns: np.ndarray
+    """(3, nv) the trunk's, about its principal axes."""
 
 
 @functools.lru_cache(maxsize=8)
@@ -81,15 +91,16 @@ def _at_rest(model: mujoco.MjModel, trunk: int) -> _AtRest:
     centres, turns = np.zeros((2, model.nbody, 3, model.nv))
     for body in range(model.nbody):
         mujoco.mj_jacBodyCom(model, data, centres[body], turns[body], body)
+    principal = _principal(model, trunk).T @ turns[trunk]
     part = _spatial_inertia(
-        centres[trunk], turns[trunk], model.body_mass[trunk], model.body_inertia[trunk]
+        centres[trunk], principal, model.body_mass[trunk], model.body_inertia[trunk]
     )
     mujoco.mj_jacBody(model, data, centres[trunk], None, trunk)
-    return _AtRest(trunk, whole - part, centres, turns)
+    return _AtRest(trunk, whole - part, centres, turns, principal)
 
 
 def _spatial_inertia(centre: Array, turn: Array, mass: Array, inertia: Array) -> Array:
-    """Joint-space inertia (..., nv, nv) of a body whose frame is aligned with the world's."""
+    """Joint-space inertia (..., nv, nv) of a body, `turn` about its principal axes."""
     xp = centre.__array_namespace__()
     moving = xp.asarray(mass)[..., None, None] * (xp.matrix_transpose(centre) @ centre)
     return moving + turn.T @ (xp.asarray(inertia)[..., None] * turn)
@@ -119,7 +130,7 @@ def inverse_weights(
     # v(centre) = v(origin) + omega x centre
     lever = -xp.cross(centre[..., None, :], turn.T, axis=-1)
     moved = rest.centres[rest.trunk] + xp.matrix_transpose(lever)
-    whole = rest.inertia + _spatial_inertia(moved, turn, mass, inertia)
+    whole = rest.inertia + _spatial_inertia(moved, rest.trunk_turns, mass, inertia)
     inverse = xp.linalg.inv(whole)
 
     def mean_diagonal(jacobian: Array) -> Array:

@@ -28,14 +28,14 @@ from mjx_balance.config import (
     to_dict,
 )
 from mjx_balance.dqn import heads
-from mjx_balance.robots import find_robot
+from mjx_balance.robots import Robot, find_robot, robot_from_dict
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
 
 FORMAT = "mjx_balance.policy"
-FORMAT_VERSION = 3
-UPGRADED = 2
-UPGRADE = ", and policies/upgrade.py in the project's repository rewrites files of 2"
+FORMAT_VERSION = 4
+UPGRADED = 3
+UPGRADE = ", and policies/upgrade.py in the project's repository rewrites files of 3"
 MOST_BYTES = 64 * 2**20
 MOST_MANIFEST = 4 * 2**20
 """Larger files and manifests are no policies, whatever they say."""
@@ -50,8 +50,8 @@ class Policy:
     """A greedy policy in NumPy.
 
     Calling it maps observations to action indices. `.manifest` is the file's JSON,
-    `.config` the config it was trained with, `.actions` the (num_actions, 2) height
-    changes in m that the indices stand for.
+    `.config` the config it was trained with, `.robot` the robot, `.actions` the
+    (num_actions, 2) height changes in m that the indices stand for.
     """
 
     def __init__(self, manifest: dict[str, Any], weights: Mapping[str, np.ndarray]):
@@ -60,7 +60,7 @@ class Policy:
         Raises:
           PolicyError: if manifest and weights do not fit together.
         """
-        self.config = _read_config(manifest)
+        self.config, self.robot = _read_config(manifest)
         self.manifest = manifest
         self.scene_hash: str = manifest["scene_hash"]
         self.actions = action_table(self.config.task)
@@ -125,8 +125,8 @@ class Policy:
         return heads.Radial(out, self._profile, self._stretch, self.factors)
 
 
-def _read_config(manifest: Any) -> Config:
-    """The config of a manifest, all of whose other parts follow from it.
+def _read_config(manifest: Any) -> tuple[Config, Robot]:
+    """Config and robot of a manifest, all of whose other parts follow from them.
 
     Raises:
       PolicyError: for another format, a config that cannot be run, or a part that differs.
@@ -141,6 +141,7 @@ def _read_config(manifest: Any) -> Config:
             )
     for name, kind in (
         ("config", dict),
+        ("robot", dict),
         ("scene_hash", str),
         ("versions", dict),
         ("training", dict),
@@ -149,13 +150,17 @@ def _read_config(manifest: Any) -> Config:
             what = {dict: "a JSON object", str: "a string"}[kind]
             raise PolicyError(f"its {name} is {shown(manifest.get(name))}; it must be {what}")
     try:
-        config = check(from_dict(Config, manifest["config"]))
+        robot = robot_from_dict(manifest["robot"])
+    except ValueError as error:
+        raise PolicyError(f"its robot cannot be used: {error}") from error
+    try:
+        config = check(from_dict(Config, manifest["config"]), robot)
     except ConfigError as error:
         raise PolicyError(f"its config cannot be used: {error}") from error
-    for part, wanted in _described(config).items():
+    for part, wanted in _described(config, robot).items():
         if manifest.get(part) != wanted:
             raise PolicyError(f"its {part} is not what its own config gives")
-    return config
+    return config, robot
 
 
 def _check_weights(
@@ -201,16 +206,16 @@ def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) 
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "config": to_dict(config),
-        **_described(config),
+        **_described(config, find_robot(config.robot)),
         "scene_hash": scene_hash,
         "versions": versions,
         "training": dict(training),
     }
 
 
-def _described(config: Config) -> dict[str, Any]:
+def _described(config: Config, robot: Robot) -> dict[str, Any]:
     """What follows from a config, written out for whoever runs the policy elsewhere."""
-    task, robot = config.task, find_robot(config.robot)
+    task = config.task
     return {
         "robot": to_dict(robot),
         "network": {

@@ -2,31 +2,27 @@
 
 import dataclasses
 import hashlib
-import math
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from mjx_balance.config import Config, ConfigError
-from mjx_balance.robots import Robot, find_robot
+from mjx_balance.robots import Robot, find_robot, robot_spec
+from mjx_balance.robots.building import (
+    ACCELEROMETER,
+    GYRO,
+    VISUAL_GROUP,
+    scene_dir,
+)
 from mjx_balance.task import Array
 from mjx_balance.task.decision import Targets
 from mjx_balance.task.kinematics import joint_angles
 
-VISUAL_GROUP = 2
 ROBOT, BOARD = "robot/", "board/"
 CONTACT_TIME = 0.01
 """Time constant of the foot contacts, s: near the shortest that 4 ms steps carry."""
 SETTLE_STEPS = 750
 SETTLE_ROUNDS = 4
-
-
-def scene_dir() -> Path:
-    """Folder of the MJCF files: in the installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    installed = package / "scenes"
-    return installed if installed.is_dir() else package.parent / "scenes"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,18 +88,19 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
       visual: whether to keep the geoms that are only looked at; without them
         MJX has a sixth of the geoms to move.
     """
-    stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
-    board = mujoco.MjSpec.from_file(str(scene_dir() / "board.xml"))
     robot = find_robot(config.robot)
-    body = mujoco.MjSpec.from_file(str(scene_dir() / robot.model))
+    stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
     height = config.task.body_height
-    stage.attach(board, prefix=BOARD, frame=stage.worldbody.add_frame())
+    stage.attach(_board(robot), prefix=BOARD, frame=stage.worldbody.add_frame())
+    body = robot_spec(config.robot, visual)
+    for name in (x for x in dir(stage.option) if not x.startswith("_")):
+        setattr(body.option, name, getattr(stage.option, name))
     stage.attach(body, prefix=ROBOT, frame=stage.worldbody.add_frame(pos=[0, 0, height]))
     friction = robot.foot_friction
-    for leg, foot in zip(robot.legs, robot.feet, strict=True):
+    for leg in robot.legs:
         stage.add_pair(
-            name=f"{leg}_contact",
-            geomname1=f"{ROBOT}{foot}",
+            name=f"{leg.name}_contact",
+            geomname1=f"{ROBOT}{leg.foot}",
             geomname2=f"{BOARD}board",
             condim=3,
             friction=[friction, friction, 0.005, 0.0001, 0.0001],
@@ -113,43 +110,27 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
     if not visual:
         for geom in [g for g in stage.geoms if g.group == VISUAL_GROUP]:
             stage.delete(geom)
-    model = stage.compile()
-    for name, modelled in robot_numbers(robot, model).items():
-        value = getattr(robot, name)
-        if not math.isclose(modelled, value, rel_tol=1e-3):
-            raise ConfigError(
-                f"{name} is {value}, but the robot in {robot.model} has {modelled:g}; "
-                "change both or neither"
-            )
-    return model
+    return stage.compile()
 
 
-def robot_numbers(robot: Robot, model: mujoco.MjModel) -> dict[str, float]:
-    """Reads the numbers of a robot's record back from the compiled model, in their units."""
-    abduction, hip_joint, knee = (f"{ROBOT}{name}" for name in robot.joints[0])
-    hip, thigh, calf = (
-        model.body(model.jnt_bodyid[model.joint(name).id]) for name in (abduction, hip_joint, knee)
-    )
-    foot = model.geom(f"{ROBOT}{robot.feet[0]}")
-    trunk = model.body(f"{ROBOT}{robot.trunk}")
-    knee_joint, knee_servo = model.joint(knee), model.actuator(knee)
-    hip_servo = model.actuator(hip_joint)
-    return {
-        "hip_x": hip.pos[0],
-        "hip_y": hip.pos[1],
-        "abduction_offset": thigh.pos[1],
-        "thigh": -calf.pos[2],
-        "calf": -foot.pos[2],
-        "foot_radius": foot.size[0],
-        "trunk_mass": trunk.mass[0],
-        "total_mass": trunk.subtreemass[0],
-        "knee_min": knee_joint.range[0],
-        "knee_max": knee_joint.range[1],
-        "hip_torque": hip_servo.forcerange[1],
-        "knee_torque": knee_servo.forcerange[1],
-        "servo_stiffness": knee_servo.gainprm[0],
-        "servo_damping": np.ravel(knee_joint.damping)[0],
-    }
+def _board(robot: Robot) -> mujoco.MjSpec:
+    """The board, as large, heavy and stiff for this robot as ours is for our own."""
+    board = mujoco.MjSpec.from_file(str(scene_dir() / "board.xml"))
+    longer, heavier = robot.size_scale, robot.mass_scale
+    if longer == heavier == 1:
+        return board
+    for geom in board.geoms:
+        geom.pos, geom.size = geom.pos * longer, geom.size * longer
+        geom.fromto = geom.fromto * longer
+    body = board.body("board")
+    body.mass, body.inertia = body.mass * heavier, body.inertia * heavier * longer**2
+    body.ipos = body.ipos * longer
+    for joint in board.joints:
+        joint.armature *= heavier * longer**2
+        joint.damping = joint.damping * heavier * longer**2
+    for servo in board.actuators:
+        servo.set_to_position(kp=servo.gainprm[0] * heavier * longer**2)
+    return board
 
 
 def load_scene(config: Config, visual: bool = False) -> Scene:
@@ -164,9 +145,9 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     leg_qpos = np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names])
     leg_ctrl = np.asarray([[model.actuator(n).id for n in leg] for leg in names])
     board = [f"{BOARD}board_{axis}" for axis in "xy"]
-    joint = model.joint(f"{ROBOT}{robot.root}")
+    joint = model.joint(int(model.body(f"{ROBOT}{robot.trunk}").jntadr[0]))
     root = joint.qposadr[0]
-    sensors = [model.sensor(f"{ROBOT}{name}") for name in (robot.gyro, robot.accelerometer)]
+    sensors = [model.sensor(f"{ROBOT}{name}") for name in (GYRO, ACCELEROMETER)]
     imu = np.concatenate([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in sensors])
     return Scene(
         config=config,

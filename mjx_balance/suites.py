@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_balance.config import Config, RandomizationConfig, greatest_incline
+from mjx_balance.config import Config, RandomizationConfig, greatest_incline, scaled_to
 from mjx_balance.robots import find_robot
 from mjx_balance.task import tilt
 from mjx_balance.task.pushes import Pushes, draw_kicks, kicked_decisions
@@ -24,7 +24,7 @@ def authority(config: Config) -> float:
     """
     robot = find_robot(config.robot)
     speed = config.task.action_max / config.task.ctrl_dt
-    return math.degrees(speed / max(robot.hip_x, robot.half_track))
+    return math.degrees(speed / robot.lever)
 
 
 def _disc(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
@@ -140,7 +140,8 @@ def make_scenarios(
             f"{longest:.1f} s to its target; the period must not be shorter"
         )
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
-    return scenario, draw_conditions(chosen.randomization, robot, others[:, :DRAWS])
+    ranges = scaled_to(chosen.randomization, robot)
+    return scenario, draw_conditions(ranges, robot, others[:, :DRAWS])
 
 
 def make_pushes(config: Config, suite: str, scenarios: int, duration: float, seed: int) -> Pushes:
@@ -153,7 +154,7 @@ def make_pushes(config: Config, suite: str, scenarios: int, duration: float, see
     Raises:
       SuiteError: for an unknown suite.
     """
-    ranges = find_suite(suite).randomization
+    ranges = scaled_to(find_suite(suite).randomization, find_robot(config.robot))
     at = kicked_decisions(config.task, ranges, duration)
     rngs = [np.random.default_rng((seed, k, 2)) for k in range(scenarios)]
     uniform = np.asarray([rng.uniform(size=(len(at), 2)) for rng in rngs])

@@ -12,8 +12,7 @@ import pytest
 from fleet import ENVS, EPISODE, Feedback, Fleet, drive, keys, make_fleet, nominal, under
 
 from mjx_balance.config import Config, preset
-from mjx_balance.robots import Robot
-from mjx_balance.robots.quadruped import QUADRUPED
+from mjx_balance.robots import Robot, find_robot
 from mjx_balance.scene import Scene, load_scene
 
 jax.config.update("jax_num_cpu_devices", 2)
@@ -78,7 +77,7 @@ def scene(config: Config) -> Scene:
 @pytest.fixture(scope="session")
 def robot() -> Robot:
     """Our quadruped."""
-    return QUADRUPED
+    return find_robot("quadruped")
 
 
 @pytest.fixture(params=(np, jnp), ids=("numpy", "jax"))

@@ -221,9 +221,9 @@ def test_a_tilt_within_one_action_is_taken_back_at_once(
 def test_response_is_that_of_the_robots_geometry(
     robot: Robot, courses: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    """Raising the left by a tilts by a / half-track, raising the front by -a / hip_x."""
+    """Raising the left by a tilts by a / half-track, raising the front by -a / half-length."""
     gain, course = courses
-    expected = np.degrees((1 / robot.half_track, -1 / robot.hip_x))
+    expected = np.degrees((1 / robot.half_track, -1 / robot.half_length))
     np.testing.assert_allclose(gain, expected, rtol=0.08)
     assert course.shape == (2, 400)
     assert np.abs(course[:, 0]).max() < 0.1

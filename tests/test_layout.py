@@ -10,8 +10,8 @@ import mjx_balance
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
-    ("exit_codes", "quiet", "sources", "robots.record"),
-    ("robots.quadruped",),
+    ("exit_codes", "quiet", "sources", "robots.record", "robots.file"),
+    ("robots.building",),
     ("robots",),
     ("config",),
     ("task", "statistics"),

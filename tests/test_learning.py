@@ -14,7 +14,7 @@ from mjx_balance.engines.engine import Engine, Motion, PhysicsState
 from mjx_balance.env import BalanceEnv
 from mjx_balance.evaluation import evaluate
 from mjx_balance.policy import Policy, make_manifest, save_policy
-from mjx_balance.robots.quadruped import QUADRUPED
+from mjx_balance.robots import find_robot
 from mjx_balance.scene import Scene
 from mjx_balance.task.observation import observation_names
 from mjx_balance.training.devices import make_learner, size_to_device
@@ -106,7 +106,7 @@ def test_what_is_stored_is_what_happened(run: Run) -> None:
     assert timed_out.sum(axis=0).max() == 1
     for robots_on_their_feet in (stored.obs[0], stored.obs[1:][over]):
         np.testing.assert_allclose(robots_on_their_feet, 0, atol=0.05)
-    names = np.asarray(observation_names(run.config.task, QUADRUPED))
+    names = np.asarray(observation_names(run.config.task, find_robot("quadruped")))
     lean = np.char.startswith(names, "Acc_")
     assert np.abs(stored.next_obs[fell][:, lean]).max(axis=1).min() > 4
     assert np.abs(stored.next_obs[:-1][timed_out][:, lean]).max(axis=1).max() > 0.2

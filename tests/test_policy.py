@@ -137,7 +137,7 @@ def test_manifest_gives_times_and_offsets_of_the_preset_best() -> None:
     assert len(observation["names"]) == len(observation["scale"]) == 136
     assert manifest["actions"]["ramp_s"] == pytest.approx(0.02)
     assert manifest["network"] == {"hidden_sizes": [64, 64], "factors": [21, 21], "radial": True}
-    assert manifest["robot"]["legs"] == ["LF", "RF", "LH", "RH"]
+    assert [leg["name"] for leg in manifest["robot"]["legs"]] == ["LF", "RF", "LH", "RH"]
 
 
 def test_loaded_policy_equals_the_saved_one(tmp_path: Path) -> None:
@@ -198,10 +198,10 @@ def test_weights_without_a_manifest_are_refused(path: Path) -> None:
             "weight head/kernel .* not finite",
         ),
         (lambda w, m: w.pop("head/kernel"), "weight head/kernel is missing"),
-        (lambda w, m: m.update(version=99), "version is 99; this release reads 3"),
+        (lambda w, m: m.update(version=99), "version is 99; this release reads 4"),
         (
-            lambda w, m: m.update(version=2),
-            "version is 2; this release reads 3, and policies/upgrade.py",
+            lambda w, m: m.update(version=3),
+            "version is 3; this release reads 4, and policies/upgrade.py",
         ),
         (lambda w, m: m.update(format="onnx"), "format is 'onnx'"),
         (lambda w, m: m.pop("scene_hash"), "scene_hash is None; it must be a string"),
@@ -213,7 +213,16 @@ def test_weights_without_a_manifest_are_refused(path: Path) -> None:
         ),
         (lambda w, m: w.update({"head/bias": np.zeros(42, np.int32)}), "head/bias.* is I32"),
         (lambda w, m: m["config"]["task"].update(action_levels=100_001), "action_levels is 100001"),
-        (lambda w, m: m["robot"].update(thigh=0.25), "its robot is not what"),
+        (lambda w, m: m["robot"].update(wings=2), "its robot cannot be used: a robot must have"),
+        (lambda w, m: m["robot"]["legs"].pop(), "its robot cannot be used: .* four legs"),
+        (lambda w, m: m["robot"]["legs"][1].update(thigh="long"), "thigh must be a sane number"),
+        (
+            lambda w, m: m["robot"]["legs"][1].update(calf=float("nan")),
+            "calf must be a sane number",
+        ),
+        (lambda w, m: m["robot"]["legs"][1]["signs"].pop(), "signs must have 3 entries"),
+        (lambda w, m: m["robot"]["legs"][1].update(left=1), "left must be bool"),
+        (lambda w, m: m["robot"]["legs"][1].update(name="RM"), "its observation is not what"),
         (lambda w, m: m["observation"]["names"].reverse(), "its observation is not what"),
         (lambda w, m: m["network"].update(radial=True), "its network is not what"),
         (lambda w, m: m["rates_hz"].update(decision=50.0), "its rates_hz is not what"),

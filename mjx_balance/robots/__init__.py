@@ -1,17 +1,70 @@
-"""The robots that can be trained, by name."""
+"""The robots that can be trained: shipped ones by name, others by their TOML file."""
 
-from mjx_balance.robots.quadruped import QUADRUPED
-from mjx_balance.robots.record import Robot
+import functools
+from pathlib import Path
 
-ROBOTS = {robot.name: robot for robot in (QUADRUPED,)}
+import mujoco
+
+from mjx_balance.robots.building import build, model_path
+from mjx_balance.robots.file import RobotError, RobotFile, read_robot_file
+from mjx_balance.robots.record import Leg, Robot, robot_from_dict
+
+__all__ = [
+    "SHIPPED",
+    "Leg",
+    "Robot",
+    "RobotError",
+    "find_robot",
+    "robot_file",
+    "robot_from_dict",
+    "robot_spec",
+    "robot_xml",
+    "shipped",
+]
+
+SHIPPED = Path(__file__).resolve().parent
+MENAGERIE = "menagerie:"
 
 
-class RobotError(ValueError):
-    """An unknown robot; the message lists the known ones."""
+def shipped() -> list[str]:
+    """Names of the robots whose files are part of this package."""
+    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+
+
+def robot_file(name: str) -> RobotFile:
+    """What is known of the robot that `config.robot` calls `name`.
+
+    Args:
+      name: a shipped robot's; the path of a TOML file; or `menagerie:NAME`.
+
+    Raises:
+      RobotError: if there is none, or its file is wrong.
+    """
+    if name.endswith(".toml"):
+        return read_robot_file(Path(name))
+    if name not in shipped():
+        raise RobotError(f"robot is {name!r}; known robots: {', '.join(shipped())}; or a TOML file")
+    return read_robot_file(SHIPPED / f"{name}.toml")
+
+
+def robot_spec(name: str, visual: bool = False) -> mujoco.MjSpec:
+    """A robot's body (`building.build`), new each time: whoever attaches it owns it."""
+    return build(robot_file(name), visual)[0]
+
+
+def robot_xml(name: str) -> str:
+    """What `robot_spec` gives, as MJCF without looks: equal for equal bodies."""
+    spec = robot_spec(name)
+    spec.compile()
+    return spec.to_xml()
 
 
 def find_robot(name: str) -> Robot:
-    """Returns the robot called `name`; raises `RobotError` with the known names."""
-    if name not in ROBOTS:
-        raise RobotError(f"robot is {name!r}; known robots: {', '.join(ROBOTS)}")
-    return ROBOTS[name]
+    """A robot's numbers; raises as `robot_file` and `building.build`."""
+    file = robot_file(name)
+    return _measured(file, model_path(file.model, file.folder).stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=64)
+def _measured(file: RobotFile, _: int) -> Robot:
+    return build(file)[1]

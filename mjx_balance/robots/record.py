@@ -1,59 +1,78 @@
-"""The record of a robot."""
+"""A robot in numbers: what the task, the scene and a robot's own computer need to know of it."""
 
 import dataclasses
 import math
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+
+OUR_MASS, OUR_LEVER = 15.2, 0.193
+"""Of our own robot, kg and m."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Leg:
+    """Three hinges and a foot, measured in the trunk's frame: x forward, y left, z up.
+
+    A joint's angle q turns the leg by `sign * q + zero`: the abduction about x from where the
+    hip's axis is level, the thigh about y from hanging straight down, the knee about y from
+    straight. The foot is kept under the hip, in the plane that hip and knee move in.
+    """
+
+    name: str
+    left: bool
+    front: bool
+    joints: tuple[str, str, str]
+    """Abduction, hip and knee; the scene's servos have the same names."""
+    foot: str
+    """Sphere geom of the scene that touches the board."""
+    x: float
+    """Of the hip, and of the foot when it stands under it, m."""
+    y: float
+    """Of the foot, m."""
+    axis_height: float
+    """z of the abduction's axis, m."""
+    drop: float
+    """From there down to the hip, m."""
+    offset: float
+    """From there to the left, to the plane of the foot, m."""
+    thigh: float
+    """Hip to knee, m."""
+    calf: float
+    """Knee to the foot's centre, m."""
+    signs: tuple[float, float, float]
+    """Of abduction, hip and knee, +-1."""
+    zeros: tuple[float, float, float]
+    """rad"""
+    knee: tuple[float, float]
+    """Least and greatest turn of the calf against the thigh, rad; negative: the knee points
+    backward."""
+
+    def height(self, knee: float) -> float:
+        """From the trunk's origin down to the foot's centre, for a turn of the knee, m."""
+        squared = self.thigh**2 + self.calf**2 + 2 * self.thigh * self.calf * math.cos(knee)
+        return math.sqrt(squared) + self.drop - self.axis_height
 
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """What the task and the scene need to know of a robot.
-
-    The numbers repeat the model file's; `scene.build_model` compares them with the
-    compiled model. Tuples over the legs are in the order of `legs`.
-    """
+    """Measured on the compiled model by `building.measured`; legs in observation order."""
 
     name: str
-    """As `config.robot` names it."""
-    model: str
-    """MJCF file in scenes/."""
-    legs: tuple[str, ...]
-    """Names in observation order (paper Eq. 2)."""
-    left: tuple[bool, ...]
-    """Whether each leg is on the left side."""
-    front: tuple[bool, ...]
-    """Whether each leg is in front."""
-    joints: tuple[tuple[str, str, str], ...]
-    """Abduction, hip and knee joint of each leg; its servos have the same names."""
-    feet: tuple[str, ...]
-    """Sphere geoms that touch the board."""
+    """Its file's."""
+    legs: tuple[Leg, ...]
     trunk: str
-    """The body that is kept level."""
-    root: str
-    """Its free joint."""
-    gyro: str
-    """Sensor."""
-    accelerometer: str
-    """Sensor."""
-    hip_x: float
-    """Fore-aft distance of the hips from the trunk centre, m."""
-    hip_y: float
-    """Lateral distance of the abduction axes from the trunk centre, m."""
-    abduction_offset: float
-    """Lateral distance from the abduction axis to the leg plane, m."""
-    thigh: float
-    """Hip to knee, m."""
-    calf: float
-    """Knee to foot centre, m."""
+    """The body that is kept level, on a free joint."""
     foot_radius: float
-    """Radius of the feet, m."""
+    """m"""
     trunk_mass: float
-    """kg."""
+    """kg"""
     total_mass: float
-    """kg."""
-    knee_min: float
-    """rad."""
-    knee_max: float
-    """rad."""
+    """kg"""
     hip_torque: float
     """Limit of the abduction and hip servos, N m."""
     knee_torque: float
@@ -62,20 +81,112 @@ class Robot:
     """Position gain of the leg servos, N m / rad."""
     servo_damping: float
     """Damping of the leg joints, N m s / rad."""
+    servo_armature: float
+    """Inertia of rotor and gear at the joint, kg m^2."""
     foot_friction: float
     """Sliding friction of a foot on the board."""
+    body_height: float
+    """Standing height of the trunk's origin above the board, foot radius included, m."""
+    action_max: float
+    """Greatest height change of one decision on one axis, m."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the legs."""
+        return tuple(leg.name for leg in self.legs)
+
+    @property
+    def left(self) -> tuple[bool, ...]:
+        """Whether each leg is on the left side."""
+        return tuple(leg.left for leg in self.legs)
+
+    @property
+    def front(self) -> tuple[bool, ...]:
+        """Whether each leg is in front."""
+        return tuple(leg.front for leg in self.legs)
+
+    @property
+    def joints(self) -> tuple[tuple[str, str, str], ...]:
+        """Of each leg."""
+        return tuple(leg.joints for leg in self.legs)
+
+    @property
+    def feet(self) -> tuple[str, ...]:
+        """Of each leg."""
+        return tuple(leg.foot for leg in self.legs)
+
+    @property
+    def half_length(self) -> float:
+        """Greatest fore-aft distance of a foot from the trunk's origin, m."""
+        return max(abs(leg.x) for leg in self.legs)
 
     @property
     def half_track(self) -> float:
-        """Lateral distance of a foot from the trunk centre, m."""
-        return self.hip_y + self.abduction_offset
+        """Greatest lateral distance of a foot from the trunk's origin, m."""
+        return max(abs(leg.y) for leg in self.legs)
+
+    @property
+    def lever(self) -> float:
+        """The longer of the two, m: what a height change turns the body by."""
+        return max(self.half_length, self.half_track)
 
     @property
     def height_range(self) -> tuple[float, float]:
-        """Least and greatest body height above a foot's contact point, m (knee range)."""
+        """Least and greatest body height above a foot's contact point that all legs reach, m."""
+        ends = [sorted(map(leg.height, leg.knee)) for leg in self.legs]
+        least, most = max(low for low, _ in ends), min(high for _, high in ends)
+        return least + self.foot_radius, most + self.foot_radius
 
-        def height(knee: float) -> float:
-            squared = self.thigh**2 + self.calf**2 + 2 * self.thigh * self.calf * math.cos(knee)
-            return math.sqrt(squared) + self.foot_radius
+    @property
+    def mass_scale(self) -> float:
+        """Mass against our own robot's, to three decimals."""
+        return round(self.total_mass / OUR_MASS, 3)
 
-        return height(self.knee_min), height(self.knee_max)
+    @property
+    def size_scale(self) -> float:
+        """Lever against our own robot's, to three decimals."""
+        return round(self.lever / OUR_LEVER, 3)
+
+    def each(self, name: str) -> np.ndarray:
+        """One number of every leg, (legs, ...)."""
+        return np.asarray([getattr(leg, name) for leg in self.legs], float)
+
+
+def robot_from_dict(values: Any) -> Robot:
+    """Rebuilds a robot from the JSON values of `dataclasses.asdict`.
+
+    Raises:
+      ValueError: if a field is missing, unknown or of another type.
+    """
+    legs = values.get("legs") if isinstance(values, Mapping) else None
+    if not isinstance(legs, list) or len(legs) != 4:
+        raise ValueError("it must have four legs")
+    built = tuple(_record(Leg, leg) for leg in legs)
+    return _record(Robot, {**values, "legs": built})
+
+
+MOST = 1e4
+"""Of any number of a robot, in its unit: what is greater has never walked."""
+
+
+def _record(kind: type[T], values: Any) -> T:
+    hints = typing.get_type_hints(kind)
+    if not isinstance(values, Mapping) or set(values) != set(hints):
+        raise ValueError(f"a {kind.__name__.lower()} must have {', '.join(hints)}")
+    return kind(**{name: _value(name, hint, values[name]) for name, hint in hints.items()})
+
+
+def _value(name: str, hint: Any, value: Any) -> Any:
+    parts = typing.get_args(hint)
+    if parts and Ellipsis not in parts:
+        if not isinstance(value, list) or len(value) != len(parts):
+            raise ValueError(f"{name} must have {len(parts)} entries")
+        return tuple(_value(name, part, x) for part, x in zip(parts, value, strict=True))
+    kind = float if hint is float else hint
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        good = abs(value) <= MOST
+    else:
+        good = bool(parts) or type(value) is kind
+    if not good:
+        raise ValueError(f"{name} must be {'a sane number' if hint is float else hint.__name__}")
+    return value

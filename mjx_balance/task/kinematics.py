@@ -2,8 +2,7 @@
 
 A foot's height is its vertical distance below the trunk's centre, foot radius
 included (paper 3.2, "vertical distance of foot endpoint correspond to the robot
-body"). Feet move straight up and down under their hips. Another robot brings
-its own pair of functions.
+body"). Feet move straight up and down under their hips.
 """
 
 import numpy as np
@@ -17,36 +16,53 @@ def joint_angles(robot: Robot, heights: Array) -> Array:
     """Inverse kinematics.
 
     Args:
-      robot: link lengths.
+      robot: its legs.
       heights: (..., legs) m, within `robot.height_range`.
 
     Returns:
       (..., legs, 3) abduction, hip and knee angles, rad.
     """
     xp = heights.__array_namespace__()
-    length = heights - robot.foot_radius
-    a, b = robot.thigh, robot.calf
-    knee = -xp.arccos(xp.clip((length**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
-    hip = -xp.arctan2(b * xp.sin(knee), a + b * xp.cos(knee))
-    return xp.stack((xp.zeros_like(hip), hip, knee), axis=-1)
+
+    def constant(values: np.ndarray) -> np.ndarray:
+        return values.astype(heights.dtype)
+
+    a, b = robot.each("thigh"), robot.each("calf")
+    length = heights - constant(robot.foot_radius + robot.each("drop") - robot.each("axis_height"))
+    cosine = (length**2 - constant(a**2) - constant(b**2)) / constant(2 * a * b)
+    knee = constant(_bends(robot)) * xp.arccos(xp.clip(cosine, -1.0, 1.0))
+    thigh = -xp.arctan2(constant(b) * xp.sin(knee), constant(a) + constant(b) * xp.cos(knee))
+    turned = xp.stack((xp.zeros_like(thigh), thigh, knee), axis=-1)
+    return constant(robot.each("signs")) * (turned - constant(robot.each("zeros")))
 
 
 def foot_heights(robot: Robot, angles: Array) -> Array:
     """Forward kinematics, the inverse of `joint_angles`.
 
     Args:
-      robot: link lengths, sides of the legs.
+      robot: its legs.
       angles: (..., legs, 3) abduction, hip and knee angles, rad.
 
     Returns:
       (..., legs) m.
     """
     xp = angles.__array_namespace__()
-    abduction, hip, knee = angles[..., 0], angles[..., 1], angles[..., 2]
-    side = np.where(robot.left, 1.0, -1.0)
-    drop = robot.thigh * xp.cos(hip) + robot.calf * xp.cos(hip + knee)
-    lateral = robot.abduction_offset * side.astype(angles.dtype) * xp.sin(abduction)
-    return drop * xp.cos(abduction) - lateral + robot.foot_radius
+
+    def constant(values: np.ndarray) -> np.ndarray:
+        return values.astype(angles.dtype)
+
+    turned = constant(robot.each("signs")) * angles + constant(robot.each("zeros"))
+    abduction, thigh, knee = turned[..., 0], turned[..., 1], turned[..., 2]
+    length = constant(robot.each("thigh")) * xp.cos(thigh)
+    length = length + constant(robot.each("calf")) * xp.cos(thigh + knee)
+    down = (length + constant(robot.each("drop"))) * xp.cos(abduction)
+    lateral = constant(robot.each("offset")) * xp.sin(abduction)
+    return down - lateral + constant(robot.foot_radius - robot.each("axis_height"))
+
+
+def _bends(robot: Robot) -> np.ndarray:
+    """(legs,) -1 where the knee points backward, 1 where forward."""
+    return np.sign(robot.each("knee").sum(axis=-1))
 
 
 def ramp(task: TaskConfig, before: Array, after: Array) -> Array:

@@ -19,8 +19,8 @@ def observation_names(task: TaskConfig, robot: Robot) -> tuple[str, ...]:
     Commanded heights are `C_LF,d-1`: LF's of the decision before the latest. With
     `task.imu_mean` = 5, `V_x,t-10` is the mean of the samples 10 to 14 steps back.
     """
-    names = [f"H_{leg}" for leg in robot.legs]
-    names += [f"C_{leg},d-{lag}" for lag in task.command_lags for leg in robot.legs]
+    names = [f"H_{leg}" for leg in robot.names]
+    names += [f"C_{leg},d-{lag}" for lag in task.command_lags for leg in robot.names]
     for symbol, lags in (("V", task.gyro_lags), ("Acc", task.accel_lags)):
         names += [f"{symbol}_{axis},t-{lag}" for axis in "xy" for lag in lags]
     return tuple(names)

@@ -22,6 +22,7 @@ from jax import export
 
 from mjx_balance.config import Config, to_dict
 from mjx_balance.engines import ffi
+from mjx_balance.robots import robot_xml
 from mjx_balance.run_folder import write_atomically
 from mjx_balance.scene import scene_dir
 from mjx_balance.sources import code
@@ -117,6 +118,7 @@ def program_key(config: Config, iterations: int, root: str) -> str:
     key.update(repr(sorted(code(root).items())).encode())
     for path in sorted(scene_dir().glob("*.xml")):
         key.update(path.name.encode() + b"\0" + path.read_bytes())
+    key.update(robot_xml(config.robot).encode())
     return key.hexdigest()[:32]
 
 

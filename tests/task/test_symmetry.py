@@ -89,12 +89,8 @@ def test_left_right_is_the_only_mirror(any_config: Config, robot: Robot) -> None
 
 def test_legs_in_another_order_have_the_same_partners(any_config: Config, robot: Robot) -> None:
     """FR FL RR RL, as makers of other robots list them: sides count, not letters."""
-    other = dataclasses.replace(
-        robot,
-        legs=("FR", "FL", "RR", "RL"),
-        left=(False, True, False, True),
-        front=(True, True, False, False),
-    )
+    other = dataclasses.replace(robot, legs=tuple(robot.legs[k] for k in (1, 0, 3, 2)))
+    assert other.left == (False, True, False, True)
     group = symmetries(any_config.task, other)
     assert group.obs_index[1][:4].tolist() == [1, 0, 3, 2]
     change = np.asarray((0.001, 0.002))
