@@ -1,4 +1,4 @@
-"""The command line: `mjx-balance train`, `sweep`, `evaluate` and `report`."""
+"""The command line: `mjx-balance train`, `sweep`, `evaluate`, `report` and `export`."""
 
 import argparse
 import dataclasses
@@ -17,7 +17,7 @@ from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.run_folder import RunFolderError, read_run_config
 
-COMMANDS = ("train", "sweep", "evaluate", "report")
+COMMANDS = ("train", "sweep", "evaluate", "report", "export")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +79,16 @@ class ReportArgs:
     """Scenarios per suite and controller."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ExportArgs:
+    """Write a policy as an ONNX model. Needs the package onnx, and no JAX."""
+
+    policy: Annotated[Path, tyro.conf.Positional]
+    """Policy file."""
+    out: Path
+    """File to write, NAME.onnx."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns its exit code, 2 for input that cannot be used."""
     argv = list(sys.argv[1:] if arguments is None else arguments)
@@ -88,7 +98,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if argv and not wants_help:
             _complain(f"unknown command {argv[0]!r}; known commands: {', '.join(COMMANDS)}")
         return 0 if wants_help else USAGE_ERROR
-    commands = {"train": _train, "sweep": _sweep, "evaluate": _evaluate, "report": _report}
+    commands = {
+        "train": _train,
+        "sweep": _sweep,
+        "evaluate": _evaluate,
+        "report": _report,
+        "export": _export,
+    }
     return commands[argv[0]](argv[1:])
 
 
@@ -264,6 +280,31 @@ def _report(argv: list[str]) -> int:
     for sentence in missing:
         print(f"mjx-balance: {sentence}", file=sys.stderr)
     print(out)
+    return 0
+
+
+def _export(argv: list[str]) -> int:
+    args = tyro.cli(ExportArgs, args=argv, prog="mjx-balance export")
+    if args.out.suffix != ".onnx":
+        return _complain(f"out is {args.out}; its name must end in .onnx")
+    try:
+        from mjx_balance.onnx_export import OPSET, export_onnx
+
+        policy = load_policy(args.policy)
+        size = export_onnx(policy, args.out)
+    except ImportError as error:
+        return _complain(f"export needs the package onnx, as of pip install onnx: {error}")
+    except PolicyError as error:
+        return _complain(str(error))
+    except OSError as error:
+        return _complain(f"cannot write {args.out}: {error.strerror}")
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    print(f"{args.out}: {size / 1000:,.1f} kB, opset {OPSET}")
+    print(
+        f"observation (N, {policy.observation_size}) float32 -> "
+        f"q_values (N, {len(policy.actions)}) float32, action (N,) int64"
+    )
     return 0
 
 

@@ -51,7 +51,8 @@ class Policy:
 
     Calling it maps observations to action indices. `.manifest` is the file's JSON,
     `.config` the config it was trained with, `.robot` the robot, `.actions` the
-    (num_actions, 2) height changes in m that the indices stand for.
+    (num_actions, 2) height changes in m that the indices stand for, `.layers` the kernels
+    and biases.
     """
 
     def __init__(self, manifest: dict[str, Any], weights: Mapping[str, np.ndarray]):
@@ -79,16 +80,16 @@ class Policy:
         for name, n, m in zip(names, rows, columns, strict=True):
             shapes |= {f"{name}/kernel": (n, m), f"{name}/bias": (m,)}
         _check_weights(weights, shapes)
-        self._layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
+        self.layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
         if self.radial:
-            self._profile, self._stretch = weights["profile"], weights["stretch"]
+            self.profile, self.stretch = weights["profile"], weights["stretch"]
 
     @property
     def fingerprint(self) -> str:
         """Short digest of the weights."""
-        arrays = [array for layer in self._layers for array in layer]
+        arrays = [array for layer in self.layers for array in layer]
         if self.radial:  # as they enter the head
-            arrays += [np.logaddexp(0, self._profile), np.exp(self._stretch)]
+            arrays += [np.logaddexp(0, self.profile), np.exp(self.stretch)]
         return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
     def q_values(self, obs: np.ndarray) -> np.ndarray:
@@ -116,13 +117,13 @@ class Policy:
                 f"obs has shape {x.shape}; it must be ({self.observation_size},) or "
                 f"(batch, {self.observation_size})"
             )
-        for kernel, bias in self._layers[:-1]:
+        for kernel, bias in self.layers[:-1]:
             x = np.maximum(x @ kernel + bias, 0.0)
-        kernel, bias = self._layers[-1]
+        kernel, bias = self.layers[-1]
         if not self.radial:
             return heads.Added(x @ kernel + bias, self.factors)
         out = np.concatenate((x, obs), axis=-1) @ kernel + bias
-        return heads.Radial(out, self._profile, self._stretch, self.factors)
+        return heads.Radial(out, self.profile, self.stretch, self.factors)
 
 
 def _read_config(manifest: Any) -> tuple[Config, Robot]:
@@ -196,21 +197,23 @@ def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) 
       scene_hash: fingerprint of the scene it was trained in.
       training: provenance, e.g. decisions and seconds.
     """
-    versions = {}
-    for package in VERSIONED:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
     return {
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "config": to_dict(config),
         **_described(config, find_robot(config.robot)),
         "scene_hash": scene_hash,
-        "versions": versions,
+        "versions": {package: installed_version(package) for package in VERSIONED},
         "training": dict(training),
     }
+
+
+def installed_version(package: str) -> str | None:
+    """Version of an installed package, none of one that is not."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def _described(config: Config, robot: Robot) -> dict[str, Any]:

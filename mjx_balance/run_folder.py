@@ -118,14 +118,19 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes a file whole or not at all, whenever the process or the machine dies.
 
     Raises:
-      OSError: if it cannot be written; what was there before is then still there.
+      OSError: if it cannot be written; what was there before is then still there, and no more.
     """
     part = path.with_name(f"{path.name}.part")
-    with part.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    try:
+        with part.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise
 
 
 def write_json(path: Path, values: Any) -> None:

@@ -24,7 +24,7 @@ FLOORS = (
         *"dqn.acting dqn.means dqn.networks dqn.replay dqn.whitening".split(),
     ),
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
-    ("model_fields", "dqn.learner"),
+    ("model_fields", "dqn.learner", "onnx_export"),
     ("engines", "engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
     ("engines.mjx", "engines.compiled", "evaluation"),
     ("engines.warp",),
@@ -48,7 +48,7 @@ FLOORS = (
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
-    "controllers evaluation statistics render report display".split()
+    "controllers evaluation statistics render report display onnx_export".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}

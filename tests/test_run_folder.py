@@ -69,6 +69,7 @@ def test_a_failed_write_leaves_the_old_file(
     with pytest.raises(OSError, match="full"):
         write_atomically(file, "new")
     assert file.read_text() == "old"
+    assert os.listdir(tmp_path) == ["file.json"]
 
 
 def test_a_new_folder_has_config_and_provenance_and_nothing_beside_it(folder: RunFolder) -> None:

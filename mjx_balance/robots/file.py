@@ -156,7 +156,9 @@ def _leg(name: str, values: Any) -> LegFile:
             raise RobotError(
                 f"{key} of leg {name} is {values[key]!r}; it must be {' or '.join(options)}"
             )
-    return LegFile(name, (joints[0], joints[1], joints[2]), where, values.get("side"), values.get("end"))
+    return LegFile(
+        name, (joints[0], joints[1], joints[2]), where, values.get("side"), values.get("end")
+    )
 
 
 def _refuse_unknown(what: str, values: Mapping[str, Any], known: set[str]) -> None:

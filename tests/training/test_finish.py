@@ -35,7 +35,7 @@ def export(folder: RunFolder, *scales: float) -> tuple[list[Policy], list[str]]:
 
 
 def first_weight(policy: Policy) -> float:
-    return float(policy._layers[0][0].ravel()[0])
+    return float(policy.layers[0][0].ravel()[0])
 
 
 FIRST = float(PARAMS["params"]["hidden_0"]["kernel"].ravel()[0])  # pyright: ignore

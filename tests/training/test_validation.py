@@ -138,7 +138,7 @@ def exported(folder: RunFolder, export: Any, *scales: float) -> tuple[list[float
     learner: Any = Learner()
     policies = finish.export(config, learner, "hash", folder, state_of(*scales), 1.0, said.append)
     first = PARAMS["params"]["hidden_0"]["kernel"].ravel()[0]  # pyright: ignore
-    return [float(p._layers[0][0].ravel()[0] / first) for p in policies], said
+    return [float(p.layers[0][0].ravel()[0] / first) for p in policies], said
 
 
 def test_the_run_hands_out_its_last_policy_or_its_best(folder: RunFolder) -> None:
