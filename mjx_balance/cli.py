@@ -1,8 +1,9 @@
-"""The command line: `mjx-balance train`, `sweep`, `evaluate`, `report` and `export`."""
+"""The command line: `mjx-balance train`, `sweep`, `evaluate`, `report`, `export` and `robot`."""
 
 import argparse
 import dataclasses
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.run_folder import RunFolderError, read_run_config
 
-COMMANDS = ("train", "sweep", "evaluate", "report", "export")
+COMMANDS = ("train", "sweep", "evaluate", "report", "export", "robot")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +90,26 @@ class ExportArgs:
     """File to write, NAME.onnx."""
 
 
+@dataclasses.dataclass(frozen=True)
+class RobotCheckArgs:
+    """Build a robot, tilt it, and say what was found."""
+
+    robot: Annotated[str, tyro.conf.Positional]
+    """TOML file, shipped robot's name, or menagerie:NAME."""
+    picture: Path | None = None
+    """PNG to draw it to; none: NAME.png in this folder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotNewArgs:
+    """Draft a robot's TOML file from its model."""
+
+    model: Annotated[str, tyro.conf.Positional]
+    """MJCF or URDF file, PACKAGE:PATH of one in a Python package, or menagerie:NAME."""
+    out: Path | None = None
+    """File to write; none: the terminal."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns its exit code, 2 for input that cannot be used."""
     argv = list(sys.argv[1:] if arguments is None else arguments)
@@ -104,6 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "evaluate": _evaluate,
         "report": _report,
         "export": _export,
+        "robot": _robot,
     }
     return commands[argv[0]](argv[1:])
 
@@ -305,6 +327,60 @@ def _export(argv: list[str]) -> int:
         f"observation (N, {policy.observation_size}) float32 -> "
         f"q_values (N, {len(policy.actions)}) float32, action (N,) int64"
     )
+    return 0
+
+
+def _robot(argv: list[str]) -> int:
+    """`mjx-balance robot check ROBOT` and `mjx-balance robot new MODEL`."""
+    commands = {"check": _robot_check, "new": _robot_new}
+    if not argv or argv[0] not in commands:
+        return _complain("say robot check FILE.toml, or robot new MODEL.xml")
+    return commands[argv[0]](argv[1:])
+
+
+def _robot_check(argv: list[str]) -> int:
+    args = tyro.cli(RobotCheckArgs, args=argv, prog="mjx-balance robot check")
+    from mjx_balance import inspection, render
+
+    try:
+        scene, tilted = inspection.find_out(args.robot)
+    except ConfigError as error:
+        return _complain(str(error))
+    print("\n".join(inspection.described(scene, tilted)))
+    picture = args.picture or Path(f"{scene.robot.name.replace(':', '_')}.png")
+    try:
+        render.write(picture, scene.config, tilted.qpos[None])
+    except render.RenderError as error:
+        print(f"mjx-balance: no picture drawn: {error}", file=sys.stderr)
+        return FAILED
+    print(f"picture: {picture}")
+    return 0
+
+
+def _robot_new(argv: list[str]) -> int:
+    args = tyro.cli(RobotNewArgs, args=argv, prog="mjx-balance robot new")
+    from mjx_balance.robots import RobotError
+    from mjx_balance.robots.building import model_path
+    from mjx_balance.robots.draft import draft
+
+    try:
+        path = model_path(args.model, Path())
+        model = args.model
+        if args.out is not None:
+            if args.out.exists():
+                return _complain(f"{args.out} exists already")
+            if path == Path(model):
+                model = os.path.relpath(path, args.out.parent)
+        text = draft(model, path)
+        if args.out is None:
+            print(text, end="")
+        else:
+            args.out.write_text(text)
+            print(f"{args.out}: see `mjx-balance robot check {args.out}`")
+    except RobotError as error:
+        return _complain(str(error))
+    except OSError as error:
+        return _complain(f"cannot write {error.filename}: {error.strerror}")
     return 0
 
 

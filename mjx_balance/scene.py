@@ -193,8 +193,17 @@ def settle(
     mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
     upright = np.abs(data.qpos[root + 4 : root + 6]).max() < 0.01
     if not (upright and np.abs(data.qvel).max() < 0.01):
+        share = np.abs(data.actuator_force[leg_ctrl]) / model.actuator_forcerange[leg_ctrl, 1]
+        leg, joint = np.unravel_index(np.argmax(share), share.shape)
+        if share.max() > 0.99:
+            raise ConfigError(
+                f"robot {robot.name} weighs {robot.total_mass:.1f} kg, too much for its servos: "
+                f"{robot.legs[leg].joints[joint]!r} needs more than its "
+                f"{model.actuator_forcerange[leg_ctrl[leg, joint], 1]:g} N m to stand at "
+                f"body_height {task.body_height} m"
+            )
         raise ConfigError(
-            f"the robot does not stand still at body_height {task.body_height} m with "
+            f"robot {robot.name} does not stand still at body_height {task.body_height} m with "
             f"servo_stiffness {robot.servo_stiffness} N m/rad; try the defaults"
         )
     return Stance(

@@ -12,6 +12,7 @@ PACKAGE = Path(mjx_balance.__file__).resolve().parent
 FLOORS = (
     ("exit_codes", "quiet", "sources", "robots.record", "robots.file"),
     ("robots.building",),
+    ("robots.draft",),
     ("robots",),
     ("config",),
     ("task", "statistics"),
@@ -26,7 +27,7 @@ FLOORS = (
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner", "onnx_export"),
     ("engines", "engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
-    ("engines.mjx", "engines.compiled", "evaluation"),
+    ("engines.mjx", "engines.compiled", "evaluation", "inspection"),
     ("engines.warp",),
     ("engines.choice",),
     ("env",),
@@ -48,7 +49,7 @@ FLOORS = (
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
-    "controllers evaluation statistics render report display onnx_export".split()
+    "controllers evaluation inspection statistics render report display onnx_export".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}

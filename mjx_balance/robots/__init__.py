@@ -6,7 +6,13 @@ from pathlib import Path
 import mujoco
 
 from mjx_balance.robots.building import build, model_path
-from mjx_balance.robots.file import RobotError, RobotFile, read_robot_file
+from mjx_balance.robots.draft import draft
+from mjx_balance.robots.file import (
+    RobotError,
+    RobotFile,
+    parse_robot_file,
+    read_robot_file,
+)
 from mjx_balance.robots.record import Leg, Robot, robot_from_dict
 
 __all__ = [
@@ -42,9 +48,19 @@ def robot_file(name: str) -> RobotFile:
     """
     if name.endswith(".toml"):
         return read_robot_file(Path(name))
+    if name.startswith(MENAGERIE):
+        return _drafted(name)
     if name not in shipped():
-        raise RobotError(f"robot is {name!r}; known robots: {', '.join(shipped())}; or a TOML file")
+        raise RobotError(
+            f"robot is {name!r}; known robots: {', '.join(shipped())}; or menagerie:NAME, or a "
+            "TOML file"
+        )
     return read_robot_file(SHIPPED / f"{name}.toml")
+
+
+@functools.lru_cache(maxsize=8)
+def _drafted(model: str) -> RobotFile:
+    return parse_robot_file(draft(model, model_path(model, Path())), Path(model))
 
 
 def robot_spec(name: str, visual: bool = False) -> mujoco.MjSpec:

@@ -114,13 +114,17 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     radius = _foot_radius(file, feet)
     _keep_inertia(spec, trunk)
     spheres = [_sphere(foot, name, radius) for name, foot in feet.items()]
+    names = [sphere.name for sphere in spheres]
     _leave_geoms(spec, trunk, spheres, visual)
+    # A foot on a body of its own, with no joint, would slide more: MuJoCo sets friction's softness
+    # by what it takes a contact's body for, the light tip of a leg or all of its calf.
+    spec.fuse_static()
     bare = _compiled(spec)
     _check_joints(bare, file)
     if _align(spec, trunk, bare, file):
         bare = _compiled(spec)
-    robot = _measured(file, bare, [x.name for x in spheres], radius)
-    _equip(spec, trunk, file, robot)
+    robot = _measured(file, bare, names, radius)
+    _equip(spec, robot, _imu(spec, trunk, bare, file))
     return spec, robot
 
 
@@ -283,7 +287,7 @@ def _check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
             if model.joint(joint).type[0] != mujoco.mjtJoint.mjJNT_HINGE:
                 raise RobotError(f"joint {joint!r} of leg {name} is no hinge")
             body = int(model.jnt_bodyid[model.joint(joint).id])
-            if above not in _ancestors(model, body):
+            if above not in ancestors(model, body):
                 raise RobotError(
                     f"joint {joint!r} of leg {name} does not hang on {model.body(above).name!r}; "
                     "joints go from the trunk down: abduction, hip, knee"
@@ -295,7 +299,7 @@ def _check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
         raise RobotError(f"joint {extra[0]!r} is in no leg; strip it, and it is fixed")
 
 
-def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
+def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
     """The bodies that a body hangs on, without itself, up to the world."""
     found = []
     while body:
@@ -383,10 +387,8 @@ def _measured(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: f
     trunk = model.body(file.trunk)
     mass = _clean(trunk.subtreemass[0])
     hips = [joint for leg in legs for joint in leg.joints[:2]]
-    hip_torque = file.hip_torque or min(_torque(model, x, "hip_torque") for x in hips)
-    knee_torque = file.knee_torque or min(
-        _torque(model, leg.joints[2], "knee_torque") for leg in legs
-    )
+    hip_torque = file.hip_torque or min(_torque(model, x) for x in hips)
+    knee_torque = file.knee_torque or min(_torque(model, leg.joints[2]) for leg in legs)
     robot = Robot(
         name=file.name,
         legs=legs,
@@ -456,7 +458,7 @@ def _leg(file: RobotFile, model: mujoco.MjModel, said: LegFile, foot: str) -> Le
     name, joints = said.name, said.joints
     calf = int(model.jnt_bodyid[model.joint(joints[2]).id])
     holder = int(model.geom(foot).bodyid[0])
-    if calf not in (holder, *_ancestors(model, holder)):
+    if calf not in (holder, *ancestors(model, holder)):
         raise RobotError(
             f"foot of leg {name} hangs on body {model.body(holder).name!r}; it must hang on what "
             f"joint {joints[2]!r} moves, {model.body(calf).name!r}"
@@ -576,7 +578,11 @@ def _check_corners(file: RobotFile, legs: tuple[Leg, ...]) -> None:
         corners[corner] = leg.name
 
 
-def _torque(model: mujoco.MjModel, joint: str, field: str) -> float:
+UNLIMITED = 1e4
+"""Torque of servos that neither file nor model limit, N m."""
+
+
+def _torque(model: mujoco.MjModel, joint: str) -> float:
     """What the model's own actuators can do at a joint, N m."""
     number = model.joint(joint).id
     limits = []
@@ -596,14 +602,10 @@ def _torque(model: mujoco.MjModel, joint: str, field: str) -> float:
         if motor and model.actuator_ctrllimited[k]:
             gain = model.actuator_gainprm[k, 0]
             limits.append(gear * gain * np.abs(model.actuator_ctrlrange[k]).max())
-    if not limits:
-        raise RobotError(
-            f"its model does not limit the torque of joint {joint!r}; say {field}, in N m"
-        )
-    return float(min(limits))
+    return float(min(limits, default=UNLIMITED))
 
 
-def _equip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile, robot: Robot) -> None:
+def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
     """Gives the robot its servos and its IMU."""
     for element in [*spec.actuators, *spec.tendons]:
         spec.delete(element)
@@ -624,7 +626,6 @@ def _equip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile, robot: R
                 forcerange=[-torque, torque],
             )
             servo.set_to_position(kp=robot.servo_stiffness)
-    site = _imu(spec, trunk, file)
     for name, kind in (
         (GYRO, mujoco.mjtSensor.mjSENS_GYRO),
         (ACCELEROMETER, mujoco.mjtSensor.mjSENS_ACCELEROMETER),
@@ -632,16 +633,17 @@ def _equip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile, robot: R
         spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site)
 
 
-def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> str:
+def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file: RobotFile) -> str:
     """Name of a site on the trunk with x forward, y left, z up."""
+    place = np.asarray(file.imu if isinstance(file.imu, tuple) else (0.0, 0.0, 0.0))
     if isinstance(file.imu, str):
-        site = _find(spec.sites, file.imu, "imu", "sites")
-        if site.parent.name != trunk.name:
-            raise RobotError(f"imu {file.imu!r} is on body {site.parent.name!r}, not on the trunk")
-        place = np.array(site.pos)
-        if site.frame is None and np.allclose(site.quat, (1, 0, 0, 0)):
+        _find(spec.sites, file.imu, "imu", "sites")
+        site = model.site(file.imu)
+        holder = model.body(int(site.bodyid[0])).name
+        if holder != trunk.name:
+            raise RobotError(f"imu {file.imu!r} is on body {holder!r}, not on the trunk")
+        if np.allclose(site.quat, (1, 0, 0, 0)):
             return site.name
-    else:
-        place = np.asarray(file.imu or (0.0, 0.0, 0.0))
+        place = site.pos
     trunk.add_site(name=IMU, pos=place)
     return IMU

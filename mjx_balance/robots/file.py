@@ -81,16 +81,25 @@ def read_robot_file(path: Path) -> RobotFile:
       RobotError: if it is missing, or something in it is not what it must be.
     """
     try:
-        values = tomllib.loads(path.read_text())
+        text = path.read_text()
     except FileNotFoundError:
         raise RobotError(
             f"no robot file at {path}; `mjx-balance robot new MODEL.xml` drafts one"
         ) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError) as error:
         raise RobotError(f"{path} cannot be read: {error}") from error
+    return parse_robot_file(text, path)
+
+
+def parse_robot_file(text: str, path: Path) -> RobotFile:
+    """A robot file's content; `path` gives its name and folder, and need not exist.
+
+    Raises:
+      RobotError: if something in it is not what it must be.
+    """
     try:
-        return _parsed(path, values)
-    except RobotError as error:
+        return _parsed(path, tomllib.loads(text))
+    except (RobotError, tomllib.TOMLDecodeError) as error:
         raise RobotError(f"{path}: {error}") from error
 
 
