@@ -1,12 +1,111 @@
 """Robots other than ours, made of ours."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import mujoco
+import numpy as np
+
 from mjx_balance.robots import Robot
+from mjx_balance.robots.building import scene_dir
 
 
 def with_legs(robot: Robot, **changes: Any) -> Robot:
     """The robot with the same numbers changed in all legs."""
     legs = tuple(dataclasses.replace(leg, **changes) for leg in robot.legs)
     return dataclasses.replace(robot, legs=legs)
+
+
+LEGS = ("LF", "RF", "LH", "RH")
+JOINTS = ("abduction", "hip", "knee")
+
+
+def file_text(model: Path, legs: Sequence[str] = LEGS, **extra: str) -> str:
+    """The TOML file of a robot whose parts are called as ours.
+
+    `extra` goes in front, or, for a leg's name, to its leg.
+    """
+    lines = [f'model = "{model}"', 'trunk = "trunk"']
+    lines += [f"{name} = {value}" for name, value in extra.items() if name not in legs]
+    for leg in legs:
+        joints = ", ".join(f'"{leg}_{joint}"' for joint in JOINTS)
+        lines += ["", f"[legs.{leg}]", f"joints = [{joints}]", f'foot = "{leg}_foot"']
+        lines += [extra[leg]] if leg in extra else []
+    return "\n".join(lines) + "\n"
+
+
+def our_spec() -> mujoco.MjSpec:
+    """Our own robot's model, to be made another maker's."""
+    return mujoco.MjSpec.from_file(str(scene_dir() / "quadruped.xml"))
+
+
+def turned(spec: mujoco.MjSpec, degrees: float) -> mujoco.MjSpec:
+    """Its trunk's frame turned about z, the robot itself left where it is."""
+    trunk = spec.body("trunk")
+    half = math.radians(degrees) / 2
+    quat = np.asarray([math.cos(half), 0, 0, math.sin(half)])
+    for element in (*trunk.bodies, *trunk.geoms, *trunk.sites):
+        place, turn = np.zeros(3), np.zeros(4)
+        mujoco.mju_rotVecQuat(place, element.pos, quat)
+        mujoco.mju_mulQuat(turn, quat, element.quat)
+        element.pos, element.quat = place, turn
+        element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    trunk.inertia = trunk.inertia[[1, 0, 2]] if round(degrees / 90) % 2 else trunk.inertia
+    return spec
+
+
+def backward_axes(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Every joint of the left legs turns the other way round."""
+    for joint in spec.joints:
+        if joint.name.startswith("L"):
+            joint.axis, joint.range = -joint.axis, -joint.range[::-1]
+    return spec
+
+
+def drawn_standing(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """All joint angles are zero where the robot stands with bent legs."""
+    lean = 0.7
+    for leg in LEGS:
+        for part, joint, angle in (("thigh", "hip", lean), ("calf", "knee", -2 * lean)):
+            spec.body(f"{leg}_{part}").quat = [math.cos(angle / 2), 0, math.sin(angle / 2), 0]
+            spec.joint(f"{leg}_{joint}").range = spec.joint(f"{leg}_{joint}").range - angle
+    return spec
+
+
+def with_motors(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Torque motors in another order, on geared shafts, and feet on bodies of their own.
+
+    A floor, a lamp, a keyframe, contacts, joints with friction and springs, other options.
+    """
+    for servo in [*spec.actuators, *spec.sensors]:
+        spec.delete(servo)
+    for leg in reversed(LEGS):
+        for joint, torque in zip(JOINTS, (23.7, 23.7, 45.4), strict=True):
+            gear = 9.1
+            motor = spec.add_actuator(
+                name=f"motor_{leg}_{joint}",
+                target=f"{leg}_{joint}",
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                ctrlrange=[-torque / gear, torque / gear],
+                ctrllimited=1,
+                gear=[gear, 0, 0, 0, 0, 0],
+            )
+            motor.set_to_motor()
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 1
+    for joint in spec.joints:
+        joint.frictionloss, joint.stiffness = 0.3, [2.0, 0, 0]
+    for leg in LEGS:
+        old = spec.geom(f"{leg}_foot")
+        tip = spec.body(f"{leg}_calf").add_body(name=f"{leg}_tip", pos=old.pos)
+        size = old.size
+        spec.delete(old)
+        tip.add_geom(name=f"{leg}_foot", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, mass=0)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1])
+    spec.worldbody.add_light(pos=[0, 0, 3])
+    spec.add_key(name="home", qpos=[0, 0, 0.3, 1, 0, 0, 0] + [0.0, 0.8, -1.6] * 4)
+    spec.option.timestep, spec.option.impratio = 0.001, 100
+    return spec

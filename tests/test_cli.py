@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from mjx_balance.evaluation import observing, run_suite, summarize
 from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.render import VIDEO_SIZE
 from mjx_balance.run_folder import RunFolderError, create_run_folder, locked
-from mjx_balance.scene import load_scene
+from mjx_balance.scene import load_scene, scene_dir
 from mjx_balance.training import run
 from mjx_balance.training.checkpoints import CheckpointError
 
@@ -63,7 +64,8 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (("--reward-tilt", "sideways"), "--reward-tilt"),
         (("--payload", "-1"), "payload is -1.0"),
         (("--preset", "paper", "--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
-        (("--robot", "spot"), "robot is 'spot'; known robots: quadruped"),
+        (("--robot", "rex"), "robot is 'rex'; known robots: aliengo, b2"),
+        (("--robot", "rex.toml"), "no robot file at rex.toml"),
         (("--num-envs", "64", "--num-devices", "8"), "num_devices is 8"),
         (("--eval-scenarios", "100000000"), "eval_scenarios is 100000000 and duration 60 s: that"),
         (("--learning-rate", "nan"), "learning_rate is nan"),
@@ -258,3 +260,58 @@ def test_evaluate_writes_figures_and_a_video(
     fps, frames = videos.read(tmp_path / "v.mp4")
     assert (fps, len(frames), frames.shape[1:3]) == (25, 10, VIDEO_SIZE[::-1])
     assert np.abs(frames[-1] - frames[0]).mean() > 0.1, "the board moves"
+
+
+def test_a_robots_draft_can_be_checked_and_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`robot new`, `robot check`, and the flag that a user then gives to `train`."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
+    assert main(["robot", "new", "model.xml", "--out", "rex.toml"]) == 0
+    assert "mjx-balance robot check rex.toml" in capsys.readouterr().out
+    assert 'model = "model.xml"' in Path("rex.toml").read_text()
+    assert main(["robot", "check", "rex.toml", "--picture", "rex.png"]) == 0
+    said = capsys.readouterr().out
+    assert "rex: 15.20 kg" in said
+    assert said.endswith("picture: rex.png\n")
+    assert Path("rex.png").stat().st_size > 50_000
+    assert main(["robot", "new", "model.xml"]) == 0
+    assert capsys.readouterr().out == Path("rex.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("robot",), "say robot check FILE.toml, or robot new MODEL.xml"),
+        (("robot", "buy"), "say robot check FILE.toml"),
+        (("robot", "check", "none.toml"), "no robot file at none.toml"),
+        (("robot", "new", "none.xml"), "there is no file none.xml"),
+        (("robot", "new", "menagerie:rex"), "menagerie:rex cannot be had"),
+        (("robot", "new", "rex.toml"), "rex.toml cannot be read"),
+        (("robot", "new", "model.xml", "--out", "rex.toml"), "rex.toml exists already"),
+        (("robot", "new", "model.xml", "--out", "gone/rex.toml"), "cannot write gone/rex.toml"),
+        (("evaluate", "--controller", "pd-imu", "--robot", "rex"), "robot is 'rex'"),
+    ],
+)
+def test_what_is_no_robot_is_refused(
+    arguments: tuple[str, ...],
+    named: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
+    Path("rex.toml").write_text("not a robot")
+    before = sorted(tmp_path.iterdir())
+    assert named in refuse(capsys, *arguments)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_policy_stands_on_its_own_robot_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever it is called here."""
+    said = refuse(capsys, "evaluate", str(SHIPPED), "--robot", "go1")
+    assert "trained for robot 'quadruped' (15.2 kg), and go1 is another one (12.7 kg" in said
+    flags = ["--scenarios", "1", "--duration", "1"]
+    assert main(["evaluate", str(SHIPPED), "--robot", "quadruped", *flags]) == 0

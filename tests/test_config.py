@@ -333,8 +333,8 @@ def test_value_beyond_its_bound_is_refused(section: str, name: str, value: Any) 
 
 
 def test_an_unknown_robot_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match="robot is 'spot'; known robots: quadruped"):
-        check(changed("run", robot="spot"))
+    with pytest.raises(ConfigError, match="robot is 'rex'; known robots: aliengo"):
+        check(changed("run", robot="rex"))
 
 
 def numbers() -> list[tuple[str, str]]:

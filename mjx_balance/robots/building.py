@@ -164,6 +164,9 @@ def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
     around += [*spec.keys, *spec.sensors, *spec.excludes, *spec.pairs, *spec.equalities]
     for element in around:
         spec.delete(element)
+    usual = mujoco.MjSpec()
+    for size in ("nkey", "nconmax", "njmax", "nuserdata", "memory"):
+        setattr(spec, size, getattr(usual, size))
 
 
 def _forget_moved(spec: mujoco.MjSpec, name: str) -> None:
@@ -245,7 +248,6 @@ def _sphere(foot: _Found, leg: str, radius: float) -> mujoco.MjsGeom:
         pos=foot.pos,
         size=size,
         rgba=[0, 0, 0, 0],
-        group=FOOT_GROUP,
         mass=0,
     )
 
@@ -264,6 +266,8 @@ def _leave_geoms(
     for geom in (*shown, *feet):
         geom.contype = geom.conaffinity = 0
         geom.mass = 0
+    for geom in feet:
+        geom.group = FOOT_GROUP
     for geom in shown:
         geom.group = VISUAL_GROUP
     if not visual:

@@ -1,0 +1,412 @@
+"""A maker's model becomes the same robot however it is drawn, and the one it is."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import bodies
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_balance.config import Config, ConfigError, check, fitted, preset
+from mjx_balance.controllers import make_controller, measure_response
+from mjx_balance.evaluation import run_suite
+from mjx_balance.robots import Robot, RobotError, find_robot, robot_spec, shipped
+from mjx_balance.scene import ROBOT, Scene, load_scene
+from mjx_balance.task.kinematics import foot_heights, joint_angles
+
+MAKERS = tuple(name for name in shipped() if name != "quadruped")
+Draw = Callable[[mujoco.MjSpec], mujoco.MjSpec]
+DRAWINGS: dict[str, tuple[Draw, tuple[str, ...], dict[str, str]]] = {
+    "as ours": (lambda spec: spec, bodies.LEGS, {}),
+    "other order": (lambda spec: spec, ("RH", "LF", "RF", "LH"), {}),
+    "other axes": (bodies.backward_axes, bodies.LEGS, {}),
+    "drawn standing": (bodies.drawn_standing, bodies.LEGS, {}),
+    "motors": (bodies.with_motors, bodies.LEGS, {"foot_radius": "0.022"}),
+    "looks along y": (lambda spec: bodies.turned(spec, 90), bodies.LEGS, {}),
+    "looks along -x": (
+        lambda spec: bodies.turned(spec, 180),
+        bodies.LEGS,
+        {leg: f'end = "{"front" if leg[1] == "F" else "hind"}"' for leg in bodies.LEGS},
+    ),
+    "looks along -y": (
+        lambda spec: bodies.backward_axes(bodies.turned(spec, -90)),
+        bodies.LEGS,
+        {leg: f'end = "{"front" if leg[1] == "F" else "hind"}"' for leg in bodies.LEGS},
+    ),
+}
+
+
+def written(folder: Path, spec: mujoco.MjSpec, text: str | None = None) -> str:
+    """Path of a robot's file whose model is beside it."""
+    spec.compile()
+    (folder / "model.xml").write_text(spec.to_xml())
+    (folder / "maker.toml").write_text(text or bodies.file_text(Path("model.xml")))
+    return str(folder / "maker.toml")
+
+
+@pytest.fixture(params=DRAWINGS, ids=str)
+def drawing(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Path of the file of our own robot, drawn in another way."""
+    draw, legs, extra = DRAWINGS[request.param]
+    extra = {"imu": '"imu"'} | extra
+    return written(
+        tmp_path, draw(bodies.our_spec()), bodies.file_text(Path("model.xml"), legs, **extra)
+    )
+
+
+def scene_of(robot: str) -> Scene:
+    return load_scene(check(fitted(preset("default"), robot)))
+
+
+def test_our_robot_is_the_same_however_it_is_drawn(drawing: str, robot: Robot) -> None:
+    """Up to names, order and what is where zero; gains and heights follow by the rules."""
+    other = find_robot(drawing)
+    legs = {leg.name: leg for leg in other.legs}
+    for leg in robot.legs:
+        found = dataclasses.replace(legs[leg.name], signs=leg.signs, zeros=leg.zeros)
+        plain, ours = dataclasses.asdict(found), dataclasses.asdict(leg)
+        for name, value in ours.items():
+            if isinstance(value, (float, tuple)) and name != "joints":
+                assert plain[name] == pytest.approx(value, abs=1e-6), name
+            else:
+                assert plain[name] == value, name
+    for field in dataclasses.fields(robot):
+        if field.type is float:
+            ours = getattr(robot, field.name)
+            assert getattr(other, field.name) == pytest.approx(ours, rel=2e-3), field.name
+
+
+def test_it_moves_alike_however_it_is_drawn(drawing: str, scene: Scene) -> None:
+    """What one action does to roll and pitch, after each physics step: within a hundredth."""
+    ours, other = measure_response(scene), measure_response(scene_of(drawing))
+    np.testing.assert_allclose(other.gain, ours.gain, rtol=0.01)
+    np.testing.assert_allclose(other.course, ours.course, atol=0.01)
+
+
+def test_it_is_seen_alike_however_it_is_drawn(drawing: str, scene: Scene) -> None:
+    """A controller that looks at the IMU alone holds it level: wrong axes or signs would not."""
+    other = scene_of(drawing)
+    found = run_suite(other, make_controller("pd-imu", other), "corner", 4, 12.0, 1)
+    ours = run_suite(scene, make_controller("pd-imu", scene), "corner", 4, 12.0, 1)
+    assert not found.fell.any()
+    assert found.tilt.mean() == pytest.approx(ours.tilt.mean(), rel=0.05)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_kinematics_agree_with_mujoco(name: str) -> None:
+    """Heights from any angles, and back, against the compiled model's own feet."""
+    scene, robot = scene_of(name), find_robot(name)
+    data, rng = mujoco.MjData(scene.model), np.random.default_rng(0)
+    for height in np.linspace(*robot.height_range, 7):
+        angles = joint_angles(robot, np.full(4, height))
+        feet = feet_of(scene, data, angles)
+        np.testing.assert_allclose(-feet[:, 2] + robot.foot_radius, height, atol=1e-6)
+        np.testing.assert_allclose(feet[:, 0], robot.each("x"), atol=1e-6)
+        np.testing.assert_allclose(feet[:, 1], robot.each("y"), atol=1e-6)
+        other = angles + rng.uniform(-0.3, 0.3, (4, 3))
+        below = -feet_of(scene, data, other)[:, 2] + robot.foot_radius
+        np.testing.assert_allclose(foot_heights(robot, other), below, atol=1e-6)
+
+
+def feet_of(scene: Scene, data: mujoco.MjData, angles: np.ndarray) -> np.ndarray:
+    """(legs, 3) centres of the feet from the trunk's origin, m."""
+    data.qpos[:] = scene.model.qpos0
+    for leg, row in zip(scene.robot.legs, angles, strict=True):
+        for joint, angle in zip(leg.joints, row, strict=True):
+            data.joint(f"{ROBOT}{joint}").qpos = angle
+    mujoco.mj_kinematics(scene.model, data)
+    feet = [data.geom(f"{ROBOT}{leg.foot}").xpos for leg in scene.robot.legs]
+    return np.asarray(feet) - data.body(f"{ROBOT}{scene.robot.trunk}").xpos
+
+
+PUBLISHED = {
+    # kg, thigh and calf m, of the makers' data sheets or the models' own inertias
+    "go1": (12.74, 0.213, 0.213, 23.7),
+    "go2": (15.21, 0.213, 0.213, 45.43),
+    "b2": (83.50, 0.35, 0.35, 300.0),
+    "aliengo": (24.64, 0.25, 0.25, 44.4),
+    "mini_cheetah": (12.47, 0.209, 0.18, 45.43),
+    "spot": (50.34, 0.321, 0.3365, 135.278),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_makers_robot_is_what_it_is(name: str) -> None:
+    robot, (mass, thigh, calf, torque) = find_robot(name), PUBLISHED[name]
+    assert robot.total_mass == pytest.approx(mass, abs=0.01)
+    assert robot.knee_torque == torque
+    for leg in robot.legs:
+        assert (leg.thigh, leg.calf) == pytest.approx((thigh, calf), abs=1e-3)
+        assert (leg.name[1] == "L", leg.name[0] == "F") == (leg.left, leg.front)
+        assert max(leg.knee) < 0, "knees point backward"
+    low, high = robot.height_range
+    assert low < robot.body_height < high
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_makers_robot_can_follow_the_board(name: str) -> None:
+    """With our own's margin: 15 mm/s at 0.193 m, 4.45 deg/s, against the board's 3.5."""
+    scene = scene_of(name)
+    gain = measure_response(scene).gain
+    per_second = 5 * scene.config.task.action_max * np.abs(gain)
+    assert per_second.min() == pytest.approx(4.45, rel=0.08)
+    found = run_suite(scene, make_controller("rate-oracle", scene), "corner", 4, 12.0, 0)
+    assert not found.fell.any()
+    assert found.tilt.mean() < 0.15
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_only_feet_touch_and_only_our_servos_pull(name: str) -> None:
+    scene = scene_of(name)
+    model, robot = scene.model, scene.robot
+    assert not model.geom_contype.any()
+    assert not model.geom_conaffinity.any()
+    assert (model.npair, model.nu, model.nkey, model.ntendon, model.neq) == (4, 14, 0, 0, 0)
+    assert model.nmesh == 0, "looks are left out"
+    assert not model.dof_frictionloss.any()
+    assert model.body_mass[1:].sum() == pytest.approx(robot.total_mass + 10 * robot.mass_scale)
+    assert model.opt.timestep == 0.004
+    assert model.opt.impratio == 1
+    for k, leg in enumerate(robot.legs):
+        for j, joint in enumerate(leg.joints):
+            servo = model.actuator(f"{ROBOT}{joint}")
+            assert servo.id == scene.leg_ctrl[k, j]
+            assert model.jnt_qposadr[servo.trnid[0]] == scene.leg_qpos[k, j]
+            limit = robot.knee_torque if j == 2 else robot.hip_torque
+            assert servo.forcerange.tolist() == [-limit, limit]
+            assert servo.gainprm[0] == robot.servo_stiffness
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_looks_are_there_for_the_eye(name: str) -> None:
+    """And change nothing else."""
+    config = check(fitted(preset("default"), name))
+    shown = load_scene(config, visual=True)
+    assert shown.model.nmesh > 0
+    assert shown.hash == load_scene(config).hash
+
+
+def test_rules_of_size_by_hand() -> None:
+    """B2: 83.498 kg on legs of 0.7 m; feet 0.3285 m ahead, 0.19173 m aside.
+
+    Height 0.77 * 0.7 + 0.032; heights change by 3 mm * 0.3285 / 0.193; servos are stiffer by
+    mass and (leg * height / half-track)^2: 5.4933 * (0.7 * 0.571 / 0.19173 / 1.05)^2 = 21.66.
+    """
+    robot = find_robot("b2")
+    assert robot.body_height == 0.571
+    assert robot.action_max == 0.00511
+    assert robot.servo_stiffness == pytest.approx(400 * 21.66, rel=2e-3)
+    assert robot.servo_damping == pytest.approx(16 * 21.66, rel=2e-3)
+    assert robot.servo_armature == pytest.approx(0.02 * 21.66, rel=5e-3)
+    assert (robot.mass_scale, robot.size_scale) == (5.493, 1.702)
+
+
+def test_the_board_grows_with_the_robot() -> None:
+    scene, ours = scene_of("b2"), scene_of("quadruped")
+    board, our_board = (x.model.geom("board/board") for x in (scene, ours))
+    np.testing.assert_allclose(board.size, 1.702 * our_board.size, rtol=1e-6)
+    assert board.pos[2] == pytest.approx(-board.size[2]), "it is stood on at the pivot's height"
+    heavy, light = (x.model.body("board/board") for x in (scene, ours))
+    assert heavy.mass[0] == pytest.approx(5.493 * light.mass[0])
+    np.testing.assert_allclose(heavy.inertia, 5.493 * 1.702**2 * light.inertia, rtol=1e-6)
+    stiff, soft = (x.model.actuator("board/board_x") for x in (scene, ours))
+    assert stiff.gainprm[0] == pytest.approx(5.493 * 1.702**2 * soft.gainprm[0])
+
+
+@pytest.mark.parametrize("name", [*MAKERS, "quadruped"])
+def test_feet_hold_as_well_as_ours(name: str) -> None:
+    """Regularised friction lets every robot creep; a light body for a foot, twice as fast."""
+    from mjx_balance.inspection import tilted
+
+    assert tilted(scene_of(name)).creep < 0.005
+
+
+def test_config_follows_the_robot() -> None:
+    """Loads and kicks too; for our own robot nothing changes."""
+    best = preset("best")
+    assert fitted(best, "quadruped") == best
+    big = fitted(best, "b2")
+    assert (big.robot, big.task.body_height, big.task.action_max) == ("b2", 0.571, 0.00511)
+    assert big.task.height_scale == pytest.approx(0.01702)
+    assert big.randomization.payload == pytest.approx(5 * 5.493)
+    assert big.randomization.payload_offset == pytest.approx(0.05 * 1.702)
+    assert big.randomization.payload_height == pytest.approx(0.08 * 1.702)
+    assert big.randomization.push_max == pytest.approx(0.4 * 1.702)
+    assert (big.task.fail_tilt, big.task.board_rate) == (6.0, 3.5)
+
+
+def test_a_files_own_numbers_win(tmp_path: Path) -> None:
+    said = {
+        "servo_stiffness": "300.0",
+        "servo_damping": "11.0",
+        "servo_armature": "0.03",
+        "foot_friction": "0.6",
+        "foot_radius": "0.03",
+        "hip_torque": "20.0",
+        "knee_torque": "40.0",
+        "body_height": "0.33",
+        "action_max": "0.0025",
+    }
+    text = bodies.file_text(Path("model.xml"), **said, imu="[0.1, 0.02, 0.03]")
+    name = written(tmp_path, bodies.our_spec(), text)
+    robot = find_robot(name)
+    for field, value in said.items():
+        assert getattr(robot, field) == float(value), field
+    scene = scene_of(name)
+    model = scene.model
+    foot = model.geom(f"{ROBOT}{robot.legs[0].foot}")
+    assert foot.size[0] == 0.03
+    assert model.site(f"{ROBOT}balance_imu").pos.tolist() == [0.1, 0.02, 0.03]
+    assert model.pair_friction[0, 0] == 0.6
+
+
+def strip_spec() -> mujoco.MjSpec:
+    """With a neck that carries a head of 2 kg, and a tail that wags."""
+    spec = bodies.our_spec()
+    for name, mass in (("neck", 2.0), ("tail", 0.5)):
+        body = spec.body("trunk").add_body(name=name, pos=[0.2, 0, 0.1])
+        body.mass, body.ipos, body.inertia = mass, [0, 0, 0], [0.01] * 3
+        body.explicitinertial = True
+        body.add_joint(name=f"{name}_joint", type=mujoco.mjtJoint.mjJNT_HINGE)
+    return spec
+
+
+def test_what_is_stripped_is_gone_or_fixed(tmp_path: Path) -> None:
+    """A body goes with its weight, a joint leaves the weight."""
+    text = bodies.file_text(Path("model.xml"), strip='["neck", "tail_joint"]')
+    assert find_robot(written(tmp_path, strip_spec(), text)).total_mass == pytest.approx(15.7)
+
+
+def heavy_spec() -> mujoco.MjSpec:
+    spec = bodies.our_spec()
+    spec.body("trunk").mass = 400
+    return spec
+
+
+def short_spec() -> mujoco.MjSpec:
+    spec = bodies.our_spec()
+    for leg in bodies.LEGS:
+        spec.joint(f"{leg}_knee").range = [-1.2, -1.0]
+    return spec
+
+
+def tied_spec() -> mujoco.MjSpec:
+    spec = bodies.our_spec()
+    spec.delete(spec.joint("root"))
+    return spec
+
+
+def swapped(old: str, new: str) -> Callable[[str], str]:
+    def edit(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("spec", "edit", "message"),
+    [
+        (bodies.our_spec, swapped('"trunk"', '"torso"'), "trunk is 'torso', which its model"),
+        (tied_spec, str, "trunk 'trunk' has no free joint"),
+        (bodies.our_spec, swapped('"LF_hip"', '"LF_hop"'), "joint 'LF_hop' of leg LF is none"),
+        (
+            bodies.our_spec,
+            swapped('"LF_hip", "LF_knee"', '"LF_knee", "LF_hip"'),
+            "joint 'LF_hip' of leg LF does not hang on 'LF_calf'",
+        ),
+        (
+            bodies.our_spec,
+            swapped('foot = "LF_foot"', 'foot = "RF_foot"'),
+            "foot of leg LF hangs on body 'RF_calf'; it must hang on .* 'LF_calf'",
+        ),
+        (bodies.our_spec, swapped('"LF_foot"', '"LF_paw"'), "foot of leg LF is 'LF_paw', which"),
+        (
+            bodies.our_spec,
+            lambda text: text + 'side = "left"\n',
+            "leg RH is said to be left, but it stands right",
+        ),
+        (
+            bodies.our_spec,
+            swapped('"LF_foot"\n', '"LF_foot"\nend = "front"\n'),
+            "end is said of some legs only",
+        ),
+        (
+            lambda: _moved("LH_hip", [0.1, 0.0465, 0]),
+            str,
+            "legs LF and LH both stand front left",
+        ),
+        (strip_spec, str, "joint 'neck_joint' is in no leg; strip it"),
+        (strip_spec, swapped("trunk =", 'strip = ["nose"]\ntrunk ='), "strip names 'nose', which"),
+        (short_spec, str, "too short for the board: its legs reach from 0.3"),
+        (
+            lambda: _axis("RF_knee", [0, 0, 1]),
+            str,
+            r"joint 'RF_knee' of leg RF turns about \(0.00, 0.00, 1.00\)",
+        ),
+        (
+            lambda: _axis("RF_abduction", [0, 1, 0]),
+            str,
+            "joint 'RF_abduction' of leg RF turns about",
+        ),
+        (bodies.our_spec, swapped("trunk =", 'imu = "LF_foot"\ntrunk ='), "imu 'LF_foot' is on"),
+        (bodies.our_spec, swapped("trunk =", 'imu = "eye"\ntrunk ='), "imu is 'eye', which"),
+        (bodies.our_spec, swapped("model.xml", "gone.xml"), "but there is no file .*gone.xml"),
+        (bodies.our_spec, swapped("model.xml", "maker.toml"), "maker.toml cannot be read"),
+        (
+            bodies.our_spec,
+            swapped("model.xml", "no_such_package:a.xml"),
+            "the Python package 'no_such_package' is not installed",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_named(
+    spec: Callable[[], mujoco.MjSpec], edit: Callable[[str], str], message: str, tmp_path: Path
+) -> None:
+    name = written(tmp_path, spec(), edit(bodies.file_text(Path("model.xml"))))
+    with pytest.raises(RobotError, match=message) as caught:
+        find_robot(name)
+    assert str(caught.value).count("\n") == 0
+    with pytest.raises(ConfigError, match=message):
+        fitted(preset("default"), name)
+
+
+def _moved(body: str, pos: list[float]) -> mujoco.MjSpec:
+    spec = bodies.our_spec()
+    spec.body(body).pos = pos
+    return spec
+
+
+def _axis(joint: str, axis: list[float]) -> mujoco.MjSpec:
+    spec = bodies.our_spec()
+    spec.joint(joint).axis = axis
+    return spec
+
+
+def test_too_heavy_for_its_servos(tmp_path: Path) -> None:
+    name = written(tmp_path, heavy_spec())
+    with pytest.raises(
+        ConfigError, match=r"weighs 408\.3 kg, too much for its servos: '.._(hip|knee)'"
+    ):
+        scene_of(name)
+
+
+def test_an_unlimited_servo_has_no_limit(tmp_path: Path) -> None:
+    spec = bodies.our_spec()
+    for servo in [*spec.actuators]:
+        spec.delete(servo)
+    assert find_robot(written(tmp_path, spec)).knee_torque == 1e4
+
+
+def test_a_spec_is_new_each_time(robot: Robot) -> None:
+    """Whoever attaches one owns it."""
+    first = robot_spec("quadruped")
+    first.body("trunk").mass = 1.0
+    assert robot_spec("quadruped").body("trunk").mass == 6.92
+
+
+def test_unknown_names_list_the_known(config: Config) -> None:
+    with pytest.raises(RobotError, match="robot is 'rex'; known robots: aliengo, b2, go1, go2"):
+        find_robot("rex")

