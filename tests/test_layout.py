@@ -10,7 +10,7 @@ import mjx_balance
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
-    ("exit_codes", "quiet", "sources", "robots.record"),
+    ("exit_codes", "quiet", "sources", "gym_registration", "robots.record"),
     ("robots.quadruped",),
     ("robots",),
     ("config",),
@@ -26,11 +26,12 @@ FLOORS = (
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner"),
     ("engines", "engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
-    ("engines.mjx", "engines.compiled", "evaluation"),
+    ("engines.mjx", "engines.compiled", "evaluation", "boards"),
     ("engines.warp",),
     ("engines.choice",),
     ("env",),
     ("render", "display", "report"),
+    ("gym_envs",),
     ("report.figures", "report.tables", "report.digest"),
     ("report.reading",),
     ("report.measuring",),
@@ -48,7 +49,8 @@ FLOORS = (
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
-    "controllers evaluation statistics render report display".split()
+    "controllers evaluation statistics render report display boards gym_registration "
+    "gym_envs".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}
