@@ -43,6 +43,8 @@ class _Actions:
         Raises:
           InvalidAction: if it holds them not.
         """
+        # Of a space of several whole numbers, older versions of Gymnasium take any for one.
+        kinds = "iu" if self._table is not None else "f"
         try:
             array = np.asarray(action)
             if self._table is None:  # a share is as good in float64
@@ -50,7 +52,7 @@ class _Actions:
                     array = array.astype(np.float32)
         except (TypeError, ValueError):
             array = None
-        if array is None or not space.contains(array):
+        if array is None or array.dtype.kind not in kinds or not space.contains(array):
             raise InvalidAction(f"{_named(action, array, self.space)}; it must be in {space}")
         return array
 
@@ -194,6 +196,8 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         "render_fps": 5,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
+    # Of the class: one that could not be made is closed too.
+    _painter: Painter | None = None
 
     def __init__(
         self,
@@ -229,7 +233,6 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
         self._rngs: list[np.random.Generator] = []
-        self._painter: Painter | None = None
 
     def reset(
         self,

@@ -33,7 +33,7 @@ from mjx_balance.render import RenderError
 
 ENV = "mjx_balance/Balance-v0"
 STAND, LEFT_UP = 220, 20 * 21 + 10
-SCORE = {"dqn": 0.6, "ppo": 0.15}
+SCORE = {"dqn": 0.4, "ppo": 0.15}
 """Mean tilt, deg, that learning has to get below; `benchmarks/README.md` says what it comes to."""
 EXAMPLE = Path(__file__).parent.parent / "examples" / "train_sb3.py"
 RANDOM = RandomizationConfig(
@@ -236,6 +236,9 @@ def test_boards_are_those_of_training(config: Config, share: float, square: floa
     # x^2 of a disc's uniform radius of 7 deg: 49 / 3 / 2; of a square's side: 49 / 3.
     assert (targets[:, 1:] ** 2).mean() == pytest.approx(square, rel=0.04)
     np.testing.assert_allclose(targets[:, 1:].mean(axis=(0, 1)), 0, atol=0.2)
+    # x^2 y^2: in the disc 7^4 / 5 / 8; in the square (49 / 3)^2. Both axes go together.
+    both = (1 - share) * 7**4 / 40 + share * (49 / 3) ** 2
+    assert (targets[:, 1:] ** 2).prod(axis=-1).mean() == pytest.approx(both, rel=0.05)
     assert (np.hypot(*targets.T).max() > 7.001) == (share > 0)
     assert scipy.stats.kstest(phase, "uniform", (0, 10)).pvalue > 1e-3
     assert set(rate) == {3.5}
@@ -286,10 +289,10 @@ def test_a_fall_at_the_time_limit_is_a_fall(config: Config) -> None:
 
 
 def test_a_simulation_that_mujoco_has_stopped_is_a_fall() -> None:
-    """Its state stays finite; MuJoCo's warning alone says it. A reset takes the warning back."""
+    """Its state stays sane; MuJoCo's warning alone says it. A reset takes the warning back."""
     envs = BalanceVecEnv(2)
     envs.reset(seed=0)
-    envs.boards._engine._batch.qvel[1, 11] = 1e11
+    envs.boards._engine._batch.warning[1] = 1
     seen = [envs.step(np.full(2, STAND)) for _ in range(3)]
     assert [list(step[2]) for step in seen] == [[False, True], [False, False], [False, False]]
     assert seen[0][4]["final_info"]["tilt_deg"][1] == 6
@@ -329,7 +332,7 @@ def test_many_boards_do_what_each_would_do_alone(config: Config, kind: str) -> N
         assert getattr(ours, name) == getattr(theirs, name)
     assert ours.observation_space == theirs.observation_space
     ends = np.zeros(2, int)
-    for seed in (3, None, [9, None, 1, 2, 9]):
+    for seed in (3, None, [9, None, 0, 2, 9]):
         got, wanted = (envs.reset(seed=seed) for envs in (ours, theirs))
         for a, b in zip(got, wanted, strict=True):
             same(a, b)
