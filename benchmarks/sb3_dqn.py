@@ -12,17 +12,12 @@ import dataclasses
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mjx_balance.config import Config, TaskConfig, preset
-from mjx_balance.engines.mujoco import MujocoEngine
+from mjx_balance.config import Config, preset
+from mjx_balance.gym_envs import BalanceGymEnv
 from mjx_balance.policy import Policy, make_manifest, save_policy
-from mjx_balance.scene import Scene, load_scene
-from mjx_balance.task import decision, tilt
-from mjx_balance.task.actions import action_table
-from mjx_balance.task.observation import observation_names
 
 HIDDEN = (256, 256)
 EXPLORE = 20_000
@@ -34,55 +29,6 @@ def peer_config(seed: int) -> Config:
     default = preset("default")
     dqn = dataclasses.replace(default.dqn, head="joint", hidden_sizes=HIDDEN)
     return dataclasses.replace(default, seed=seed, engine="mujoco", dqn=dqn)
-
-
-def draw_scenario(task: TaskConfig, rng: np.random.Generator) -> tilt.Scenario:
-    """One scenario (1, ...) of training, drawn as `BalanceEnv` draws its own."""
-    count = tilt.num_targets(task, task.episode_length * task.ctrl_dt)
-    disc = tilt.disc_targets(np.asarray(task.max_incline), *rng.uniform(size=(2, count)))
-    square = task.max_incline * rng.uniform(-1, 1, (count, 2))
-    targets = np.where(rng.uniform(size=(count, 1)) < task.square_share, square, disc)
-    targets[0] = 0
-    phase = rng.uniform(size=1) * task.target_period
-    return tilt.Scenario(targets[None], phase, np.full(1, task.board_rate))
-
-
-class Board:
-    """One robot on one board, with the arguments and results of a Gymnasium env."""
-
-    def __init__(self, scene: Scene):
-        """Nothing moves before `reset`."""
-        self.scene, self.task = scene, scene.config.task
-        self.table = action_table(self.task)
-        self.engine = MujocoEngine(scene, 1, threads=1)
-
-    def reset(self, scenario: tilt.Scenario) -> np.ndarray:
-        """Starts from the settled stance; returns the observation (obs_size,)."""
-        scene, stance = self.scene, self.scene.stance
-        self.engine.place(stance.qpos, stance.qvel, stance.qacc_warmstart)
-        self.scenario, self.decisions = scenario, 0
-        self.memory = decision.start(self.task, scene.robot, stance.imu[None])
-        angles = stance.qpos[None, scene.leg_qpos]
-        obs = decision.observation(self.task, scene.robot, self.memory, angles)
-        return obs[0].astype(np.float32)
-
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Takes one decision: observation, reward, fallen, out of time, nothing else."""
-        task, scene = self.task, self.scene
-        now = np.full(1, float(self.decisions))
-        memory, targets = decision.controls(
-            task, scene.robot, self.memory, self.table[[action]], None, self.scenario, now
-        )
-        motion = self.engine.advance(np.arange(1), scene.ctrl(targets))
-        angles = motion.qpos[:, -1, scene.leg_qpos]
-        self.memory, outcome = decision.outcome(
-            task, scene.robot, memory, motion.imu, motion.tilt, angles
-        )
-        self.decisions += 1
-        fell = bool(outcome.fell[0] or motion.warned[0])
-        late = not fell and self.decisions >= task.episode_length
-        reward = float(sum(term[0] for term in outcome.rewards.values()))
-        return outcome.obs[0].astype(np.float32), reward, fell, late, {}
 
 
 def to_policy(
@@ -112,27 +58,13 @@ def to_policy(
 
 def train(folder: Path, decisions: int, every: int, seed: int) -> None:
     """Trains, with a policy `DECISIONS.safetensors` after each `every` decisions."""
-    import gymnasium  # pyright: ignore[reportMissingImports]
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import DQN  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
 
     config = peer_config(seed)
-    scene = load_scene(config)
-
-    class Env(gymnasium.Env):
-        def __init__(self) -> None:
-            size = len(observation_names(config.task, scene.robot))
-            self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,))
-            self.action_space = gymnasium.spaces.Discrete(config.task.num_actions)
-            self.board = Board(scene)
-
-        def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-            super().reset(seed=seed)
-            return self.board.reset(draw_scenario(config.task, self.np_random)), {}
-
-        def step(self, action):
-            return self.board.step(int(action))
+    env = BalanceGymEnv(config=config)
+    scene_hash = env.boards.scene.hash
 
     class Checkpoints(BaseCallback):
         def _on_step(self) -> bool:
@@ -141,14 +73,14 @@ def train(folder: Path, decisions: int, every: int, seed: int) -> None:
             state = self.model.policy.q_net.state_dict()
             layers = {name: value.detach().numpy() for name, value in state.items()}
             path = folder / f"{self.num_timesteps}.safetensors"
-            to_policy(path, layers, config, scene.hash, self.num_timesteps)
+            to_policy(path, layers, config, scene_hash, self.num_timesteps)
             print(self.num_timesteps, flush=True)
             return bool(sys.stdin.readline())
 
     torch.set_num_threads(1)  # faster than two with layers of this size
     model = DQN(
         "MlpPolicy",
-        Env(),
+        env,
         learning_rate=1e-3,
         buffer_size=config.dqn.replay_capacity,
         learning_starts=1_000,

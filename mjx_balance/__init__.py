@@ -1,11 +1,12 @@
 """Massively parallel DQN training of a quadruped that balances on a tilting board.
 
 `BalanceEnv` needs JAX and is imported on first use, so that `load_policy` works
-where JAX is not installed.
+where JAX is not installed. Where Gymnasium is, it knows `mjx_balance/Balance-v0`.
 """
 
 from typing import TYPE_CHECKING
 
+from mjx_balance.gym_registration import register_when_imported
 from mjx_balance.policy import load_policy
 from mjx_balance.quiet import quiet_imports
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from mjx_balance.env import BalanceEnv
 
 __all__ = ["BalanceEnv", "load_policy"]
+
+register_when_imported()
 
 
 def __getattr__(name: str) -> object:

@@ -175,19 +175,14 @@ class BalanceEnv(Env):
         )
 
     def _scenario(self, key: jax.Array) -> tilt.Scenario:
-        """Draws the targets, and the age of the first.
-
-        The random phase keeps thousands of boards from turning at the same time.
-        """
+        """Draws the targets, and the age of the first."""
         task = self.config.task
         count = tilt.num_targets(task, task.episode_length * task.ctrl_dt)
         key_disc, key_square, key_which, key_phase = jax.random.split(key, 4)
-        limit = jnp.float32(task.max_incline)
-        disc = tilt.disc_targets(limit, *jax.random.uniform(key_disc, (2, count)))
-        square = limit * jax.random.uniform(key_square, (count, 2), minval=-1.0)
-        in_square = jax.random.bernoulli(key_which, task.square_share, (count, 1))
-        targets = jnp.where(in_square, square, disc)
-        # The board starts level, so the first target is one it has already reached.
-        targets = targets.at[0].set(0.0)
-        phase = jax.random.uniform(key_phase) * task.target_period
-        return tilt.Scenario(targets, phase, jnp.float32(task.board_rate))
+        return tilt.draw_scenario(
+            task,
+            disc=jax.random.uniform(key_disc, (2, count)),
+            square=jax.random.uniform(key_square, (count, 2), minval=-1.0),
+            which=jax.random.uniform(key_which, (count, 1)),
+            phase=jax.random.uniform(key_phase),
+        )

@@ -1,17 +1,24 @@
-"""Pictures and videos of a rollout, drawn offscreen. No JAX.
+"""Pictures and videos of a rollout, drawn offscreen, and a window to watch one in. No JAX.
 
 MuJoCo chooses its OpenGL backend when it is imported, and a backend that does not
 work can take the process with it. So the drawing is done by this file in a process
-of its own, with EGL first and then OSMesa (`python -m mjx_balance.render`).
+of its own, with EGL first and then OSMesa (`python -m mjx_balance.render`). A window's
+OpenGL is the display's, whatever the backend.
 """
 
+import contextlib
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -23,6 +30,7 @@ FPS = 25
 VIDEO_SIZE = (960, 544)
 PICTURE_SIZE = (1280, 720)
 BACKENDS = ("egl", "osmesa")
+CHILD = (sys.executable, "-m", "mjx_balance.render")
 
 
 class RenderError(RuntimeError):
@@ -41,37 +49,176 @@ def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") ->
     Raises:
       RenderError: if no OpenGL backend works here, or the file cannot be written.
     """
-    stride = max(1, round(1 / (FPS * config.task.sim_dt)))
-    chosen = os.environ.get("MUJOCO_GL")
-    backends = (chosen,) if chosen else BACKENDS if platform.system() == "Linux" else ("",)
+    stride = frame_stride(config)
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder) / "job.npz"
         header = {"config": to_dict(config), "camera": camera, "path": str(path.absolute())}
         header["fps"] = 1 / (stride * config.task.sim_dt)
         np.savez(job, qpos=qpos[::stride], header=json.dumps(header))
         reason = ""
-        for backend in backends:
-            environment = os.environ | ({"MUJOCO_GL": backend} if backend else {})
-            command = [sys.executable, "-m", "mjx_balance.render", str(job)]
+        for environment in _environments():
+            command = [*CHILD, str(job)]
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
             if done.returncode == 0:
                 return
-            reason = (done.stderr.strip().splitlines() or ["unknown reason"])[-1]
-    raise RenderError(
-        f"offscreen rendering with {' or '.join(backends)} failed ({reason}); on Debian, "
+            reason = done.stderr
+    raise _failed(reason)
+
+
+class Painter:
+    """Draws one state after the other, in a process of its own that stays until `close`."""
+
+    def __init__(self, config: Config, camera: str = "main"):
+        """Starts the process.
+
+        Args:
+          config: gives the scene.
+          camera: a camera of scene.xml.
+
+        Raises:
+          RenderError: if no OpenGL backend works here.
+        """
+        header = json.dumps({"config": to_dict(config), "camera": camera})
+        reason = ""
+        for environment in _environments():
+            self._said = tempfile.TemporaryFile()  # noqa: SIM115 closed by _end
+            pipe = subprocess.PIPE
+            self._child: Any = subprocess.Popen(
+                CHILD, env=environment, stdin=pipe, stdout=pipe, stderr=self._said
+            )
+            with contextlib.suppress(BrokenPipeError):  # it is gone already: nothing is answered
+                self._child.stdin.write(header.encode() + b"\n")
+                self._child.stdin.flush()
+            if self._child.stdout.read(1):
+                return
+            reason = self._end()
+        raise _failed(reason)
+
+    def draw(self, qpos: np.ndarray) -> np.ndarray:
+        """A picture (height, width, 3), uint8, of a state (nq,) with or without its looks.
+
+        Raises:
+          RenderError: if the process has ended.
+        """
+        width, height = VIDEO_SIZE
+        picture = b""
+        with contextlib.suppress(BrokenPipeError):
+            self._child.stdin.write(np.ascontiguousarray(qpos, float).tobytes())
+            self._child.stdin.flush()
+            picture = self._child.stdout.read(height * width * 3)
+        if len(picture) < height * width * 3:
+            raise _failed(self._end())
+        return np.frombuffer(picture, np.uint8).reshape(height, width, 3).copy()
+
+    def close(self) -> None:
+        """Ends the process."""
+        if not self._said.closed:
+            self._end()
+
+    def _end(self) -> str:
+        """Ends the process; returns what it said."""
+        with contextlib.suppress(BrokenPipeError):
+            self._child.stdin.close()
+        self._child.stdout.close()
+        self._child.wait()
+        with self._said:
+            self._said.seek(0)
+            return self._said.read().decode(errors="replace")
+
+
+class Window:
+    """MuJoCo's viewer, in which states are played at real speed. A closed one stays closed."""
+
+    def __init__(self, config: Config):
+        """Opens the window.
+
+        Raises:
+          RenderError: if there is no display to open it on.
+        """
+        _check_display()
+        import mujoco.viewer
+
+        self._stride = frame_stride(config)
+        self._pause = self._stride * config.task.sim_dt
+        self._model = build_model(config, visual=True)
+        self._data = mujoco.MjData(self._model)
+        self._viewer = mujoco.viewer.launch_passive(
+            self._model, self._data, show_left_ui=False, show_right_ui=False
+        )
+        self._viewer.cam.fixedcamid = self._model.camera("main").id
+        self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._next = time.monotonic()
+
+    def play(self, qpos: np.ndarray) -> None:
+        """Shows states (steps, nq), one per physics step; returns when they are over."""
+        for state in qpos[(len(qpos) - 1) % self._stride :: self._stride]:
+            if not self._viewer.is_running():
+                return
+            with self._viewer.lock():
+                self._data.qpos[:] = state
+                mujoco.mj_forward(self._model, self._data)
+            self._viewer.sync()
+            # What came between two calls is part of the pause, and time lost is not made up for.
+            now = time.monotonic()
+            self._next = max(now, self._next + self._pause)
+            time.sleep(self._next - now)
+
+    def close(self) -> None:
+        """Closes the window."""
+        self._viewer.close()
+
+
+def frame_stride(config: Config) -> int:
+    """Physics steps from one picture to the next, at about `FPS`."""
+    return max(1, round(1 / (FPS * config.task.sim_dt)))
+
+
+def _check_display() -> None:
+    """Tries a window: MuJoCo's viewer opens its own in a thread, and hangs where it cannot."""
+    import glfw
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        window = None
+        if glfw.init():
+            glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+            window = glfw.create_window(64, 64, "mjx_balance", None, None)
+            glfw.default_window_hints()
+    if not window:
+        reason = str(said[-1].message) if said else "unknown reason"
+        raise RenderError(
+            f"no window can be opened here ({reason}); render_mode 'rgb_array' needs no display"
+        )
+    glfw.destroy_window(window)
+
+
+def _backends() -> tuple[str, ...]:
+    """What to draw with, the first that works: what the user chose, and nothing else."""
+    chosen = os.environ.get("MUJOCO_GL")
+    return (chosen,) if chosen else BACKENDS if platform.system() == "Linux" else ("",)
+
+
+def _environments() -> Iterator[dict[str, str]]:
+    """The variables of the child process for each of them."""
+    for backend in _backends():
+        yield os.environ | ({"MUJOCO_GL": backend} if backend else {})
+
+
+def _failed(said: str) -> RenderError:
+    """What the last backend's process said, in a sentence."""
+    reason = (said.strip().splitlines() or ["unknown reason"])[-1]
+    return RenderError(
+        f"offscreen rendering with {' or '.join(_backends())} failed ({reason}); on Debian, "
         "install libegl1 or libosmesa6"
     )
 
 
-def _draw(job: Path) -> None:
-    """The child process: draws what `write` saved."""
-    import imageio.v2 as imageio
-
-    with np.load(job) as saved:
-        qpos, header = saved["qpos"], json.loads(str(saved["header"]))
-    path = Path(header["path"])
-    picture = path.suffix == ".png"
-    width, height = PICTURE_SIZE if picture else VIDEO_SIZE
+@contextlib.contextmanager
+def _drawing(
+    header: dict[str, Any], size: tuple[int, int]
+) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
+    """A function from states (nq,) to pictures (height, width, 3), in the child process."""
+    width, height = size
     model = build_model(from_dict(Config, header["config"]), visual=True)
     data = mujoco.MjData(model)
     with mujoco.Renderer(model, height, width) as renderer:
@@ -82,6 +229,34 @@ def _draw(job: Path) -> None:
             renderer.update_scene(data, header["camera"])
             return renderer.render()
 
+        yield draw
+
+
+def _serve() -> None:
+    """The child process: draws what `Painter` asks for, until nothing more can come."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who watches
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # so that no library's word is a picture
+    questions = sys.stdin.buffer
+    header = json.loads(questions.readline())
+    with _drawing(header, VIDEO_SIZE) as draw:
+        answers.write(b"+")
+        answers.flush()
+        size = 8 * build_model(from_dict(Config, header["config"])).nq
+        while len(state := questions.read(size)) == size:
+            answers.write(draw(np.frombuffer(state)).tobytes())
+            answers.flush()
+
+
+def _draw(job: Path) -> None:
+    """The child process: draws what `write` saved."""
+    import imageio.v2 as imageio
+
+    with np.load(job) as saved:
+        qpos, header = saved["qpos"], json.loads(str(saved["header"]))
+    path = Path(header["path"])
+    picture = path.suffix == ".png"
+    with _drawing(header, PICTURE_SIZE if picture else VIDEO_SIZE) as draw:
         if picture:
             imageio.imwrite(path, draw(qpos[0]))
             return
@@ -91,4 +266,7 @@ def _draw(job: Path) -> None:
 
 
 if __name__ == "__main__":
-    _draw(Path(sys.argv[1]))
+    if sys.argv[1:]:
+        _draw(Path(sys.argv[1]))
+    else:
+        _serve()

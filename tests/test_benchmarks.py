@@ -1,6 +1,5 @@
 """The benchmark scripts still fit the package: they are run by hand, so nothing else would say."""
 
-import dataclasses
 import importlib.util
 import itertools
 import json
@@ -19,12 +18,10 @@ import pytest
 from flax import linen as nn
 
 from mjx_balance.config import DQNConfig, TaskConfig
-from mjx_balance.controllers import View
 from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
-from mjx_balance.evaluation import Rollout, roll_out
+from mjx_balance.evaluation import Rollout
 from mjx_balance.policy import load_policy
-from mjx_balance.scene import load_scene
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SCRIPTS = sorted(
@@ -135,80 +132,8 @@ def test_published_results_stand_while_the_code_gives_them(
 
 @pytest.fixture
 def sb3(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
-    """`benchmarks/sb3_dqn.py`, whose env needs neither Gymnasium nor torch."""
+    """`benchmarks/sb3_dqn.py`, but for the training, which needs torch."""
     return load("sb3_dqn", monkeypatch)
-
-
-def rewards_by_hand(tilts: np.ndarray) -> np.ndarray:
-    """What decisions of tilts (n, 50), deg, earn: level, and 1 for 2.5 deg less than before."""
-    mean = tilts.mean(axis=-1)
-    before = np.concatenate(([0.0], mean[:-1]))
-    return 0.4 * np.exp(-1.5 * mean) + np.clip((before - mean) / 2.5, -1, 1)
-
-
-@pytest.mark.parametrize("falls", [False, True])
-def test_the_peers_env_is_the_task_of_the_evaluation(sb3: types.ModuleType, falls: bool) -> None:
-    scene = load_scene(sb3.peer_config(0))
-    rng = np.random.default_rng(5)
-    scenario = sb3.draw_scenario(scene.config.task, rng)
-    # Ten levels up on both axes, or a little to and fro.
-    actions = np.full(60, 440) if falls else 220 + rng.integers(-2, 3, 60) * 22
-    seen = []
-
-    def recorded(view: View) -> np.ndarray:
-        seen.append(view.obs[0])
-        return actions[[view.decision]]
-
-    rollout = roll_out(scene, recorded, scenario, 12.0)
-    board = sb3.Board(scene)
-    for _ in range(2):  # the second time after a reset on the way
-        obs, rewards, fell = [board.reset(scenario)], [], False
-        while not fell and len(rewards) < 60:
-            shown, reward, fell, late, _ = board.step(int(actions[len(rewards)]))
-            assert not late
-            obs.append(shown)
-            rewards.append(reward)
-        assert fell == falls == rollout.fell[0]
-        made = len(seen)
-        assert len(rewards) == made
-        np.testing.assert_allclose(obs[:made], seen, atol=1e-5)
-        by_hand = rewards_by_hand(rollout.tilt.reshape(60, 50)[:made])
-        # After a fall the rollout's tilts are 6 deg, the env's what they were: not compared.
-        np.testing.assert_allclose(rewards[: made - falls], by_hand[: made - falls], atol=1e-6)
-        if falls:
-            assert -1.5 <= rewards[-1] < -0.5
-            assert made < 20
-
-
-def test_the_peers_env_runs_out_of_time(sb3: types.ModuleType) -> None:
-    config = sb3.peer_config(0)
-    task = dataclasses.replace(config.task, episode_length=3)
-    scene = load_scene(dataclasses.replace(config, task=task))
-    board = sb3.Board(scene)
-    for _ in range(2):
-        board.reset(sb3.draw_scenario(task, np.random.default_rng(0)))
-        assert [board.step(220)[2:4] for _ in range(3)] == [
-            (False, x) for x in (False, False, True)
-        ]
-
-
-@pytest.mark.parametrize(("share", "square"), [(0.0, 49 / 6), (1.0, 49 / 3), (0.5, 49 / 4)])
-def test_the_peers_boards_are_those_of_training(
-    sb3: types.ModuleType, share: float, square: float
-) -> None:
-    rng = np.random.default_rng(0)
-    drawn = [sb3.draw_scenario(TaskConfig(square_share=share), rng) for _ in range(1500)]
-    targets = np.concatenate([scenario.targets for scenario in drawn])
-    assert targets.shape == (1500, 7, 2)  # 60 s, whatever the phase
-    assert not targets[:, 0].any()
-    # x^2 of a disc's uniform radius of 7 deg: 49 / 3 / 2; of a square's side: 49 / 3.
-    assert (targets[:, 1:] ** 2).mean() == pytest.approx(square, rel=0.04)
-    np.testing.assert_allclose(targets[:, 1:].mean(axis=(0, 1)), 0, atol=0.2)
-    assert (np.hypot(*targets.T).max() > 7.001) == (share > 0)
-    phase = np.concatenate([scenario.phase for scenario in drawn])
-    assert phase.min() >= 0
-    assert 9.9 < phase.max() < 10
-    assert {float(scenario.rate[0]) for scenario in drawn} == {3.5}
 
 
 def test_the_peers_network_becomes_a_policy(sb3: types.ModuleType, tmp_path: Path) -> None:

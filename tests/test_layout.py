@@ -10,7 +10,7 @@ import mjx_balance
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
-    ("exit_codes", "quiet", "sources", "robots.record", "robots.file"),
+    ("exit_codes", "quiet", "sources", "gym_registration", "robots.record", "robots.file"),
     ("robots.building",),
     ("robots.draft",),
     ("robots",),
@@ -27,11 +27,12 @@ FLOORS = (
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner", "onnx_export"),
     ("engines", "engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
-    ("engines.mjx", "engines.compiled", "evaluation", "inspection"),
+    ("engines.mjx", "engines.compiled", "evaluation", "inspection", "boards"),
     ("engines.warp",),
     ("engines.choice",),
     ("env",),
     ("render", "display", "report"),
+    ("gym_envs",),
     ("report.figures", "report.tables", "report.digest"),
     ("report.reading",),
     ("report.measuring",),
@@ -49,7 +50,8 @@ FLOORS = (
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
-    "controllers evaluation inspection statistics render report display onnx_export".split()
+    "controllers evaluation inspection statistics render report display onnx_export boards "
+    "gym_registration gym_envs".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}

@@ -57,8 +57,14 @@ class MujocoEngine:
         self._batch = Batch(scene.model, count, threads or cores())
         if conditions is not None:
             self.vary(np.arange(count), conditions)
-        stance = scene.stance
-        self.place(stance.qpos, stance.qvel, stance.qacc_warmstart)
+        self.start(np.arange(count))
+
+    def start(self, ids: np.ndarray) -> None:
+        """Puts scenarios `ids` (n,) back into the settled stance."""
+        stance = self.scene.stance
+        self._batch.qpos[ids], self._batch.qvel[ids] = stance.qpos, stance.qvel
+        self._batch.qacc_warmstart[ids] = stance.qacc_warmstart
+        self._batch.warning[ids] = 0
 
     def vary(self, ids: np.ndarray, conditions: Conditions) -> None:
         """Puts scenarios `ids` (n,) into other circumstances (n,)."""

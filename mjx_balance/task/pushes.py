@@ -60,9 +60,9 @@ def kick(pushes: Pushes, decision: Array | int) -> Array:
 
     Args:
       pushes: of one env or scenario, or of a batch (...).
-      decision: () number of the decision.
+      decision: () number of the decision, or (..., 1) of each of the batch.
 
     Returns:
       (..., 2) m/s along the world's x and y; 0 where there is no kick.
     """
-    return ((pushes.at == decision)[:, None] * pushes.kicks).sum(axis=-2)
+    return ((pushes.at == decision)[..., None] * pushes.kicks).sum(axis=-2)

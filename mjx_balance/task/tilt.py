@@ -73,3 +73,30 @@ def disc_targets(incline: Array, direction: Array, magnitude: Array) -> Array:
     angle = 2 * np.pi * direction
     unit = xp.stack((xp.cos(angle), xp.sin(angle)), axis=-1)
     return (incline * magnitude)[..., None] * unit
+
+
+def draw_scenario(
+    task: TaskConfig, disc: Array, square: Array, which: Array, phase: Array
+) -> Scenario:
+    """Turns random numbers into a scenario of training.
+
+    The random phase keeps thousands of boards from turning at the same time.
+
+    Args:
+      task: inclines, the share of the square, the board's speed.
+      disc: (2, ..., n) in [0, 1): direction and magnitude of targets in the disc.
+      square: (..., n, 2) in [-1, 1): targets in the square.
+      which: (..., n, 1) in [0, 1): decides between the two.
+      phase: (...) in [0, 1): share of the period that the first target is old.
+
+    Returns:
+      A scenario, or a batch of them (...).
+    """
+    xp = disc.__array_namespace__()
+    limit = xp.asarray(task.max_incline, dtype=disc.dtype)
+    targets = xp.where(which < task.square_share, limit * square, disc_targets(limit, *disc))
+    # The board starts level, so the first target is one it has already reached.
+    first = np.arange(targets.shape[-2])[:, None] == 0
+    targets = xp.where(first, xp.zeros_like(targets), targets)
+    rate = xp.zeros_like(phase) + task.board_rate
+    return Scenario(targets, phase * task.target_period, rate)
