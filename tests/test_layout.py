@@ -10,7 +10,7 @@ import mjx_balance
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
-    ("exit_codes", "quiet", "sources", "robots.record", "robots.file"),
+    ("exit_codes", "quiet", "sources", "runtime", "robots.record", "robots.file"),
     ("robots.building",),
     ("robots",),
     ("config",),
@@ -48,7 +48,7 @@ FLOORS = (
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
-    "controllers evaluation statistics render report display".split()
+    "controllers evaluation statistics render report display runtime".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}
