@@ -10,7 +10,10 @@ import mjx_balance
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
-    ("exit_codes", "quiet", "sources", "gym_registration", "robots.record", "robots.file"),
+    (
+        *"exit_codes quiet sources gym_registration runtime".split(),
+        *("robots.record", "robots.file"),
+    ),
     ("robots.building",),
     ("robots.draft",),
     ("robots",),
@@ -51,7 +54,7 @@ FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
     "controllers evaluation inspection statistics render report display onnx_export boards "
-    "gym_registration gym_envs".split()
+    "gym_registration gym_envs runtime".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}

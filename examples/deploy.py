@@ -1,0 +1,45 @@
+"""A policy at work as on a robot: plain MuJoCo at 250 Hz and `mjx_balance/runtime.py`.
+
+python examples/deploy.py policies/best.safetensors
+"""
+
+import sys
+
+import mujoco
+import numpy as np
+
+from mjx_balance import load_policy
+from mjx_balance.evaluation import policy_scene
+from mjx_balance.runtime import Controller, State
+from mjx_balance.suites import make_scenarios
+from mjx_balance.task.attitude import body_tilt
+from mjx_balance.task.tilt import board_angle
+
+SECONDS = 20.0
+
+
+def main(path: str) -> None:
+    """Balances on a board that tilts on both axes at once, and prints the mean tilt."""
+    scene = policy_scene(load_policy(path))  # board and robot; the policy itself runs below
+    model, stance, task = scene.model, scene.stance, scene.config.task
+    data = mujoco.MjData(model)
+    data.qpos, data.qacc_warmstart = stance.qpos, stance.qacc_warmstart
+    data.sensordata[scene.imu] = stance.imu
+    boards, _ = make_scenarios(scene.config, "corner", 1, SECONDS, seed=0)
+    controller = Controller(path, clock=lambda: data.time)
+    tilts = []
+    while data.time < SECONDS:
+        gyro, accelerometer = np.split(data.sensordata[scene.imu], 2)
+        targets = controller.step(data.qpos[scene.leg_qpos], gyro, accelerometer)
+        data.ctrl[scene.leg_ctrl] = targets + stance.leg_trim
+        board = board_angle(task, boards, np.array([data.time + task.sim_dt]))[0]
+        data.ctrl[scene.board_ctrl] = np.radians(board)
+        mujoco.mj_step(model, data)
+        tilts.append(body_tilt(data.qpos[scene.trunk_quat]))
+    if controller.state is State.HOLDING:
+        print(f"held: {controller.reason}")
+    print(f"mean tilt {np.mean(tilts):.3f} deg, greatest {np.max(tilts):.3f} deg in {SECONDS:g} s")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

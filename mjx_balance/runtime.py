@@ -1,0 +1,444 @@
+"""Runs a policy on a robot: IMU and joint angles in, joint position targets out. NumPy only.
+
+This file needs nothing else of the package: copy it to the robot, beside a policy file.
+
+    controller = Controller("policy.safetensors")  # joints: controller.joints
+    ...  # bring the legs to controller.targets, where the robot stands
+    while True:  # once per IMU sample, 250 Hz
+        targets = controller.step(joint_positions, gyro, accelerometer)
+
+The targets are pure kinematics. A servo that sags under the robot's weight needs its trim added
+to them, as the simulation adds `scene.stance.leg_trim`; a servo with an integral term does not.
+
+What cannot be true makes the controller hold: the legs stay where they were last told to be, until
+`reset`, before which the robot must be back at its standing height. A loop that stops altogether is
+for the servos' own watchdog to notice.
+"""
+
+import enum
+import json
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT, FORMAT_VERSION = "mjx_balance.policy", 4
+MOST_BYTES = 64 * 2**20
+"""Larger files are no policies, whatever they say."""
+MOST_WHOLE = 100_000
+"""Of any number of a manifest: far more than any policy has."""
+GYRO_MOST = 35.0
+"""rad/s; a gyro's widest usual range is 2,000 deg/s. Balancing stays below 1."""
+ACCEL_MOST = 160.0
+"""m/s^2; an accelerometer's usual range is 16 g. Balancing stays below 20."""
+KNEE_SLACK = 0.1
+"""rad by which a knee may read beyond its stops."""
+LATE_SAMPLES = 5
+"""Sample periods between two calls, and by which a decision may last too long or too short."""
+
+
+class PolicyFileError(ValueError):
+    """A policy file that cannot be run; the message says what is wrong with it."""
+
+
+class State(enum.StrEnum):
+    """What a controller is doing."""
+
+    STANDING = "standing"
+    """At its standing height, before the first sample."""
+    BALANCING = "balancing"
+    """Deciding, sample after sample."""
+    HOLDING = "holding"
+    """The legs stay where they were last told to be, until `reset`."""
+
+
+class _Unsafe(Exception):
+    """What makes a controller hold, in a sentence."""
+
+
+class Controller:
+    """A policy at work, from one sample of the sensors to the next.
+
+    The first sample stands for all before it: the robot has been standing still. Decisions are
+    taken at the first and then every `decision_samples` samples; in between the legs follow their
+    ramp. What a decision sees and tells is what it saw and told in training.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Reads a policy file, and stands.
+
+        Args:
+          path: of the policy file.
+          clock: tells the time of a call, s; in a simulation, the simulation's.
+
+        Raises:
+          PolicyFileError: if the file is missing, damaged, or no policy this file can run.
+        """
+        path = Path(path)
+        try:
+            self.manifest, weights = _read(path)
+            self._set_up(self.manifest["config"]["task"], self.manifest)
+            self._network = _Network(self.manifest["network"], len(self._scale), weights)
+            if len(self._table) != math.prod(self._network.factors):
+                raise PolicyFileError("its action table is not what its network chooses from")
+        except PolicyFileError as error:
+            raise PolicyFileError(f"{path} cannot be used: {error}") from error
+        except KeyError as error:
+            raise PolicyFileError(f"{path} cannot be used: its manifest lacks {error}") from error
+        except (TypeError, ValueError, OverflowError, AttributeError) as error:
+            message = f"{path} cannot be used: a part of its manifest has the wrong type: {error}"
+            raise PolicyFileError(message) from error
+        self._clock = clock
+        self.reset()
+
+    def _set_up(self, task: dict[str, Any], manifest: dict[str, Any]) -> None:
+        """Takes what is needed of a manifest, and room for what is to be remembered."""
+        self._legs = legs = _Legs(manifest["robot"])
+        self.joints: list[list[str]] = [list(leg["joints"]) for leg in manifest["robot"]["legs"]]
+        """Names of the abduction, hip and knee joints of every leg, in the order of `step`."""
+        self.sample_dt = _number("sim_dt", task["sim_dt"], 1e-4, 1)
+        """Time between two IMU samples, s."""
+        self._decision_dt = _number("ctrl_dt", task["ctrl_dt"], self.sample_dt, 10)
+        self.decision_samples = round(self._decision_dt / self.sample_dt)
+        """IMU samples from one decision to the next."""
+        share = _number("action_ramp", task["action_ramp"], 0, 1)
+        ramp_steps = max(1, round(share * self.decision_samples))
+        self._share = (np.arange(1, ramp_steps + 1) / ramp_steps)[:, None]
+        self._height = _number("body_height", task["body_height"], *legs.height_range)
+        self._table = _numbers("table_m", manifest["actions"]["table_m"], (None, 2))
+
+        gyro, accel, commands = (
+            np.asarray([_whole(name, lag, 0) for lag in task[name]], int)
+            for name in ("gyro_lags", "accel_lags", "command_lags")
+        )
+        mean = _whole("imu_mean", task["imu_mean"], 1)
+        lags = np.concatenate((gyro, gyro, accel, accel))
+        self._history = int(lags.max()) + mean
+        # The history as of the last decision, then room for the samples since.
+        self._imu = np.empty((self._history + self.decision_samples, 6))
+        # Of every IMU input: the rows it is the mean of, and the channel.
+        self._rows = len(self._imu) - 1 - np.arange(mean)[:, None] - lags
+        self._channels = np.repeat((0, 1, 3, 4), (len(gyro), len(gyro), len(accel), len(accel)))
+        self._commanded = np.empty((int(commands.max(initial=0)) + 1, len(self.joints)))
+        self._command_rows = len(self._commanded) - 1 - commands
+        inputs = len(self.joints) * (1 + len(commands)) + len(lags)
+        self._scale = _numbers("scale", manifest["observation"]["scale"], (inputs,))
+        if not (self._scale > 0).all():
+            raise PolicyFileError("its scale has entries that are not above 0")
+
+        low, high = legs.limits()
+        most = np.repeat((GYRO_MOST, ACCEL_MOST), 3)
+        self._least, self._most = np.append(low, -most), np.append(high, most)
+        self._reading = np.zeros_like(self._most)
+
+    @property
+    def targets(self) -> np.ndarray:
+        """(legs, 3) rad that `step` returned last; before, those of the robot that stands."""
+        return self._targets.copy()
+
+    def reset(self) -> None:
+        """Begins anew, with a robot that has been standing still at its standing height."""
+        self.state = State.STANDING
+        self.reason = ""
+        """Why the controller is holding, in a sentence."""
+        self.action: int | None = None
+        """Index of the action that was decided on last."""
+        self._commanded[:] = self._height
+        self._path = self._legs.joint_angles(self._commanded[-1:])
+        self._targets = self._path[0]
+        self._since = 0
+        self._called = self._decided = math.nan
+
+    def hold(self, reason: str) -> None:
+        """Keeps the legs where they were last told to be, until `reset`."""
+        if self.state is not State.HOLDING:
+            self.state, self.reason = State.HOLDING, reason
+
+    def step(
+        self, joint_positions: np.ndarray, gyro: np.ndarray, accelerometer: np.ndarray
+    ) -> np.ndarray:
+        """Takes a sample of the sensors, and says where the joints shall be until the next.
+
+        It holds if a sensor reads what none does on a robot that balances, if the IMU repeats
+        itself, if a call comes too late, or if samples come at another rate than in training.
+
+        Args:
+          joint_positions: (legs, 3) abduction, hip and knee angles, rad, in the order of `joints`.
+          gyro: (3,) rad/s; x forward, y left, z up.
+          accelerometer: (3,) m/s^2, same axes; about (0, 0, 9.81) at rest.
+
+        Returns:
+          (legs, 3) joint position targets, rad.
+
+        Raises:
+          ValueError: if an argument has another shape.
+        """
+        self._take(joint_positions, gyro, accelerometer)
+        if self.state is not State.HOLDING:
+            try:
+                self._advance(self._clock())
+            except _Unsafe as unsafe:
+                self.hold(str(unsafe))
+        return self._targets.copy()
+
+    def _take(self, *arguments: np.ndarray) -> None:
+        """Writes all readings in a row: joints, gyro, accelerometer."""
+        joints, gyro, accel = (np.asarray(values, float) for values in arguments)
+        if joints.shape != self._targets.shape or gyro.shape != (3,) or accel.shape != (3,):
+            raise ValueError(
+                f"joint_positions, gyro and accelerometer have shapes {joints.shape}, {gyro.shape} "
+                f"and {accel.shape}; they must be {self._targets.shape}, (3,) and (3,)"
+            )
+        self._reading[:-6] = joints.ravel()
+        self._reading[-6:-3] = gyro
+        self._reading[-3:] = accel
+
+    def _advance(self, now: float) -> None:
+        """Goes on by the sample that was taken."""
+        self._check_reading()
+        if self.state is State.STANDING:
+            self._imu[:] = self._reading[-6:]
+            self.state = State.BALANCING
+            self._decide(now)
+        else:
+            self._check_time(now)
+            self._imu[self._history + self._since] = self._reading[-6:]
+            self._since += 1
+            if self._since == self.decision_samples:
+                self._check_decision(now)
+                self._decide(now)
+        self._called = now
+        self._targets = self._path[min(self._since, len(self._path) - 1)]
+
+    def _check_reading(self) -> None:
+        sane = (self._least <= self._reading) & (self._reading <= self._most)  # NaN is not
+        if sane.all():
+            return
+        names = [name for leg in self.joints for name in leg]
+        names += [f"{sensor} {axis}" for sensor in ("gyro", "accelerometer") for axis in "xyz"]
+        k = int(np.argmin(sane))
+        raise _Unsafe(
+            f"{names[k]} reads {self._reading[k]:.3g}, which is not between {self._least[k]:.3g} "
+            f"and {self._most[k]:.3g}"
+        )
+
+    def _check_time(self, now: float) -> None:
+        most = LATE_SAMPLES * self.sample_dt
+        if not 0 <= now - self._called <= most:
+            raise _Unsafe(
+                f"a sample came {now - self._called:.3g} s after the one before it; it must come "
+                f"within {most:.3g} s"
+            )
+
+    def _check_decision(self, now: float) -> None:
+        """Holds the samples since the last decision against the rate and against each other."""
+        took, most = now - self._decided, LATE_SAMPLES * self.sample_dt
+        if abs(took - self._decision_dt) > most:
+            raise _Unsafe(
+                f"{self.decision_samples} samples took {took:.3g} s; they must take "
+                f"{self._decision_dt:.3g} s within {most:.3g}, as in training"
+            )
+        if (self._imu[self._history - 1 :] == self._imu[-1]).all():
+            raise _Unsafe(f"the IMU gave the same sample {self.decision_samples + 1} times")
+
+    def _decide(self, now: float) -> None:
+        """Chooses an action; the next samples find its ramp in `_path`."""
+        self.action = self._network.greedy(self._observation())
+        before = self._commanded[-1].copy()
+        after = self._legs.moved(before, self._table[self.action])
+        self._commanded[:-1] = self._commanded[1:]
+        self._commanded[-1] = after
+        self._path = self._legs.joint_angles(before * (1 - self._share) + after * self._share)
+        self._imu[: self._history] = self._imu[-self._history :]
+        self._since, self._decided = 0, now
+
+    def _observation(self) -> np.ndarray:
+        """(obs_size,) the network's input."""
+        heights = self._legs.foot_heights(self._reading[:-6].reshape(-1, 3)) - self._height
+        commanded = self._commanded[self._command_rows].ravel() - self._height
+        imu = self._imu[self._rows, self._channels].mean(axis=0)
+        return np.concatenate((heights, commanded, imu)) / self._scale
+
+
+class _Legs:
+    """The robot's legs: foot heights to joint angles and back; see the manifest's `robot`."""
+
+    def __init__(self, robot: dict[str, Any]) -> None:
+        def each(name: str, *shape: int) -> np.ndarray:
+            values = [leg[name] for leg in robot["legs"]]
+            return _numbers(name, values, (len(robot["legs"]), *shape))
+
+        radius = _numbers("foot_radius", robot["foot_radius"], ())
+        self._a, self._b, self._drop = each("thigh"), each("calf"), each("drop")
+        self._offset, axis_height = each("offset"), each("axis_height")
+        self._signs, self._zeros, self._knee = each("signs", 3), each("zeros", 3), each("knee", 2)
+        if not ((self._a > 0) & (self._b > 0)).all() or not (abs(self._signs) == 1).all():
+            raise PolicyFileError("its legs have lengths that are not above 0, or signs not +-1")
+        self._bends = np.sign(self._knee.sum(axis=-1))
+        # What foot and hip add to the length between them.
+        self._rise = radius + self._drop - axis_height
+        self._lift = radius - axis_height
+        self._sides = np.where((each("left") != 0, each("front") != 0), 1.0, -1.0)
+        squared = self._a**2 + self._b**2
+        squared = squared[:, None] + 2 * (self._a * self._b)[:, None] * np.cos(self._knee)
+        reach = np.sqrt(squared) + self._rise[:, None]
+        self.height_range = float(reach.min(axis=-1).max()), float(reach.max(axis=-1).min())
+        """Least and greatest body height that all legs reach, m."""
+
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest angles of all joints that a reading can be, rad."""
+        turns = np.broadcast_to((-math.pi, math.pi), (*self._signs.shape, 2)).copy()
+        turns[:, 2] = self._knee + np.asarray((-KNEE_SLACK, KNEE_SLACK))
+        ends = self._signs[..., None] * (turns - self._zeros[..., None])
+        return ends.min(axis=-1).ravel(), ends.max(axis=-1).ravel()
+
+    def moved(self, heights: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Foot heights (legs,) after a change (2,): left legs +a_x, front legs +a_y, m."""
+        moved = heights + change[0] * self._sides[0] + change[1] * self._sides[1]
+        return np.clip(moved, *self.height_range)
+
+    def joint_angles(self, heights: np.ndarray) -> np.ndarray:
+        """(..., legs, 3) abduction, hip and knee angles, rad, for foot heights (..., legs), m."""
+        a, b = self._a, self._b
+        cosine = ((heights - self._rise) ** 2 - a**2 - b**2) / (2 * a * b)
+        knee = self._bends * np.arccos(np.clip(cosine, -1.0, 1.0))
+        thigh = -np.arctan2(b * np.sin(knee), a + b * np.cos(knee))
+        turned = np.stack((np.zeros_like(thigh), thigh, knee), axis=-1)
+        return self._signs * (turned - self._zeros)
+
+    def foot_heights(self, angles: np.ndarray) -> np.ndarray:
+        """(legs,) m below the trunk's origin, foot radius included, for joint angles (legs, 3)."""
+        abduction, thigh, knee = (self._signs * angles + self._zeros).T
+        length = self._a * np.cos(thigh) + self._b * np.cos(thigh + knee)
+        down = (length + self._drop) * np.cos(abduction) - self._offset * np.sin(abduction)
+        return down + self._lift
+
+
+class _Network:
+    """From an observation to the best action."""
+
+    def __init__(
+        self, network: dict[str, Any], inputs: int, weights: dict[str, np.ndarray]
+    ) -> None:
+        self.factors = [_whole("factors", levels, 1) for levels in network["factors"]]
+        self._radial = network["radial"] is True
+        hidden = [_whole("hidden_sizes", width, 1) for width in network["hidden_sizes"]]
+        rows, columns = [inputs, *hidden], [*hidden, sum(self.factors)]
+        if self._radial:
+            rows[-1] += inputs
+            columns[-1] = 1 + len(self.factors)
+        names = [f"hidden_{k}" for k in range(len(hidden))] + ["head"]
+        self._layers = [
+            (
+                _weight(weights, f"{name}/kernel", (n, m)),
+                _weight(weights, f"{name}/bias", (m,)),
+            )
+            for name, n, m in zip(names, rows, columns, strict=True)
+        ]
+
+    def greedy(self, observation: np.ndarray) -> int:
+        """Index of the best action; raises `_Unsafe` if there is none."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            obs = x = observation.astype(np.float32)
+            for kernel, bias in self._layers[:-1]:
+                x = np.maximum(x @ kernel + bias, 0.0)
+            kernel, bias = self._layers[-1]
+            out = (np.concatenate((x, obs)) if self._radial else x) @ kernel + bias
+        if not np.isfinite(out).all():
+            raise _Unsafe("the network gives values that are not finite numbers")
+        index = 0
+        for k, levels in enumerate(self.factors):
+            index = index * levels + (self._nearest(out, k) if self._radial else self._best(out, k))
+        return index
+
+    def _nearest(self, out: np.ndarray, axis: int) -> int:
+        """The level nearest to the best point, which a radial head gives after its value."""
+        last = np.float32(self.factors[axis] - 1)
+        return int(np.clip(np.rint((out[1 + axis] + 1) * last / 2), 0, last))
+
+    def _best(self, out: np.ndarray, axis: int) -> int:
+        """The level of the greatest value."""
+        start = sum(self.factors[:axis])
+        return int(np.argmax(out[start : start + self.factors[axis]]))
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Manifest and weights of a safetensors file: size of the header, header, numbers."""
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise PolicyFileError(f"it has {path.stat().st_size} bytes, and no policy so many")
+        content = path.read_bytes()
+        size = int.from_bytes(content[:8], "little")
+        if size > len(content) - 8:
+            raise ValueError("it ends within its header")
+        header = json.loads(content[8 : 8 + size])
+        metadata = header.pop("__metadata__", {})
+        weights = {name: _array(name, entry, content[8 + size :]) for name, entry in header.items()}
+        if sum(4 * array.size for array in weights.values()) != len(content) - 8 - size:
+            raise ValueError("its length is not that of its weights")
+    except PolicyFileError:
+        raise
+    except OSError as error:
+        raise PolicyFileError(f"it cannot be read: {error.strerror}") from error
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise PolicyFileError(f"it is damaged or no safetensors file: {error}") from error
+    try:
+        manifest = json.loads(metadata["manifest"])
+        found = manifest["format"], manifest["version"]
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise PolicyFileError("it carries no manifest of a policy of mjx_balance") from error
+    if found != (FORMAT, FORMAT_VERSION):
+        raise PolicyFileError(
+            f"it is {found[0]} version {found[1]}; this file runs {FORMAT} version {FORMAT_VERSION}"
+        )
+    return manifest, weights
+
+
+def _array(name: str, entry: dict[str, Any], content: bytes) -> np.ndarray:
+    """A weight of a safetensors file."""
+    if entry["dtype"] != "F32":
+        raise PolicyFileError(f"weight {name} is {entry['dtype']}; it must be F32 (float32)")
+    begin, end = entry["data_offsets"]
+    if not 0 <= begin <= end <= len(content):
+        raise ValueError(f"weight {name} lies outside the file")
+    return np.frombuffer(content[begin:end], "<f4").astype(np.float32).reshape(entry["shape"])
+
+
+def _weight(weights: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """A weight as the network needs it."""
+    if name not in weights or weights[name].shape != shape:
+        raise PolicyFileError(f"weight {name} is missing or not of shape {shape}")
+    if not np.isfinite(weights[name]).all():
+        raise PolicyFileError(f"weight {name} holds values that are not finite numbers")
+    return weights[name]
+
+
+def _number(name: str, value: Any, least: float, most: float) -> float:
+    if not least <= value <= most:
+        raise PolicyFileError(f"its {name} is {value}; it must be from {least:g} to {most:g}")
+    return float(value)
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    if type(value) is not int or not least <= value <= MOST_WHOLE:
+        raise PolicyFileError(
+            f"its {name} holds {value!r}; it must hold whole numbers from {least} to {MOST_WHOLE}"
+        )
+    return value
+
+
+def _numbers(name: str, values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Finite numbers of a shape, in which none is any length."""
+    array = np.asarray(values, float)
+    fits = array.ndim == len(shape) and all(
+        n in (m, None) for m, n in zip(array.shape, shape, strict=True)
+    )
+    if not fits or not (abs(array) < MOST_WHOLE).all():
+        raise PolicyFileError(f"its {name} is not {shape} sane numbers")
+    return array
