@@ -1,4 +1,4 @@
-"""The command line: `mjx-balance train`, `sweep`, `evaluate`, `report`, `export` and `robot`."""
+"""The command line, `mjx-balance`: every command, and what it says of input that it cannot use."""
 
 import argparse
 import dataclasses
@@ -12,13 +12,19 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from mjx_balance.config import Config, ConfigError, fitted, preset
+from mjx_balance import evaluation
+from mjx_balance.config import Config, ConfigError, check, fitted, preset
+from mjx_balance.controllers import Controller, ControllerError, make_controller
 from mjx_balance.exit_codes import FAILED, INTERRUPTED, USAGE_ERROR
 from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.run_folder import RunFolderError, read_run_config
+from mjx_balance.scene import Scene, load_scene
+from mjx_balance.suites import SuiteError
 
-COMMANDS = ("train", "sweep", "evaluate", "report", "export", "robot")
+COMMANDS = ("train", "sweep", "evaluate", "report", "export", "view", "robot")
+REFUSED = (PolicyError, evaluation.EvaluationError, SuiteError, ControllerError, ConfigError)
+"""What is wrong with the input of those who watch a policy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +54,7 @@ class EvaluateArgs:
     """Evaluate an exported policy in plain MuJoCo on all cores. Needs no JAX."""
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
-    """Policy file."""
+    """Policy file, or the name of a shipped one."""
     controller: str | None = None
     """Baseline to evaluate instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     robot: str | None = None
@@ -91,6 +97,22 @@ class ExportArgs:
 
 
 @dataclasses.dataclass(frozen=True)
+class ViewArgs:
+    """Watch a policy in MuJoCo's viewer; tilt the board and kick the robot by keys."""
+
+    policy: Annotated[Path | None, tyro.conf.Positional] = None
+    """Policy file, or the name of a shipped one."""
+    controller: str | None = None
+    """Baseline to watch instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
+    robot: str | None = None
+    """Robot of the baseline; of a policy, where its robot's file is now."""
+    suite: str | None = None
+    """Suite whose boards and kicks to show; none: those of the keys."""
+    seed: int = 0
+    """Seed that draws them."""
+
+
+@dataclasses.dataclass(frozen=True)
 class RobotCheckArgs:
     """Build a robot, tilt it, and say what was found."""
 
@@ -125,6 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "evaluate": _evaluate,
         "report": _report,
         "export": _export,
+        "view": _view,
         "robot": _robot,
     }
     return commands[argv[0]](argv[1:])
@@ -208,14 +231,24 @@ def _train(argv: list[str]) -> int:
     return 0
 
 
+def _who_acts(
+    policy: Path | None, baseline: str | None, robot: str | None
+) -> tuple[Scene, Controller]:
+    """A policy or a baseline, and its scene."""
+    if (policy is None) == (baseline is None):
+        raise ControllerError("name a policy file or --controller NAME, one of the two")
+    if policy is not None:
+        loaded = load_policy(policy)
+        return evaluation.policy_scene(loaded, robot=robot), evaluation.observing(loaded)
+    assert baseline is not None
+    scene = load_scene(check(fitted(preset("default"), robot or "quadruped")))
+    return scene, make_controller(baseline, scene)
+
+
 def _evaluate(argv: list[str]) -> int:
     args = tyro.cli(EvaluateArgs, args=argv, prog="mjx-balance evaluate")
-    from mjx_balance import evaluation
-    from mjx_balance.controllers import ControllerError, make_controller
     from mjx_balance.display import Display
     from mjx_balance.report.tables import evaluation_table
-    from mjx_balance.scene import load_scene
-    from mjx_balance.suites import SuiteError
 
     display = Display(Console(stderr=True))
     try:
@@ -224,16 +257,7 @@ def _evaluate(argv: list[str]) -> int:
                 return _complain(f"cannot write {path}: its folder does not exist")
         if args.video is not None and args.video.suffix != ".mp4":
             return _complain(f"video is {args.video}; its name must end in .mp4")
-        if (args.policy is None) == (args.controller is None):
-            return _complain("name a policy file or --controller NAME, one of the two")
-        if args.policy is not None:
-            policy = load_policy(args.policy)
-            scene = evaluation.policy_scene(policy, robot=args.robot)
-            controller = evaluation.observing(policy)
-        else:
-            assert args.controller is not None
-            scene = load_scene(fitted(preset("default"), args.robot or "quadruped"))
-            controller = make_controller(args.controller, scene)
+        scene, controller = _who_acts(args.policy, args.controller, args.robot)
         with display.bar(f"evaluating, suite {args.suite}") as bar:
             rollout = evaluation.run_suite(
                 scene,
@@ -252,9 +276,7 @@ def _evaluate(argv: list[str]) -> int:
         print(f"{speed:,.0f} physics steps per second")
         if args.video:
             return _video(scene, controller, args)
-    except (PolicyError, evaluation.EvaluationError, SuiteError, ControllerError) as error:
-        return _complain(str(error))
-    except ConfigError as error:
+    except REFUSED as error:
         return _complain(str(error))
     except OSError as error:
         return _complain(f"cannot write {error.filename}: {error.strerror}")
@@ -264,7 +286,7 @@ def _evaluate(argv: list[str]) -> int:
 
 
 def _video(scene, controller, args: EvaluateArgs) -> int:
-    from mjx_balance import evaluation, render
+    from mjx_balance import render
 
     assert args.video is not None
     rollout = evaluation.run_suite(
@@ -327,6 +349,34 @@ def _export(argv: list[str]) -> int:
         f"observation (N, {policy.observation_size}) float32 -> "
         f"q_values (N, {len(policy.actions)}) float32, action (N,) int64"
     )
+    return 0
+
+
+def _view(argv: list[str]) -> int:
+    args = tyro.cli(ViewArgs, args=argv, prog="mjx-balance view")
+    import mujoco
+
+    from mjx_balance import render, viewing
+
+    try:
+        scene, controller = _who_acts(args.policy, args.controller, args.robot)
+        session = viewing.Session(scene, controller, args.suite, args.seed)
+        window = render.Window(scene.config, session.press)
+    except (*REFUSED, render.RenderError) as error:
+        return _complain(str(error))
+    corners = mujoco.mjtGridPos
+    keys = "Enter: kick" if args.suite else viewing.HELP
+    try:
+        while window.is_open:
+            window.write(
+                (corners.mjGRID_TOPLEFT, *session.caption()),
+                (corners.mjGRID_BOTTOMLEFT, keys, ""),
+            )
+            window.play(session.decide())
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    finally:
+        window.close()
     return 0
 
 

@@ -273,15 +273,33 @@ def save_policy(
     return policy
 
 
+def shipped_policies() -> dict[str, Path]:
+    """The policies that come with this package, by name: `best`, and one for each other robot."""
+    package = Path(__file__).resolve().parent
+    installed = package / "policies"
+    folder = installed if installed.is_dir() else package.parent / "policies"
+    found = [*folder.glob("*.safetensors"), *(folder / "robots").glob("*.safetensors")]
+    return {path.stem: path for path in sorted(found)}
+
+
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Reads a policy file.
+
+    Args:
+      path: of the file, or a shipped policy's name.
 
     Raises:
       PolicyError: if it is missing, truncated, or not a policy this release can run.
     """
     path = Path(path)
     if not path.is_file():
-        raise PolicyError(f"no policy file at {path}; `mjx-balance train` writes one")
+        shipped = shipped_policies()
+        if str(path) not in shipped:
+            raise PolicyError(
+                f"no policy file at {path}; `mjx-balance train` writes one, and "
+                f"{', '.join(shipped)} are shipped"
+            )
+        path = shipped[str(path)]
     if path.stat().st_size > MOST_BYTES:
         raise PolicyError(
             f"{path} has {path.stat().st_size} bytes; no policy has more than {MOST_BYTES}"

@@ -129,8 +129,12 @@ class Painter:
 class Window:
     """MuJoCo's viewer, in which states are played at real speed. A closed one stays closed."""
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, on_key: Callable[[int], None] | None = None):
         """Opens the window.
+
+        Args:
+          config: gives the scene.
+          on_key: told of every key that is pressed, by GLFW's code.
 
         Raises:
           RenderError: if there is no display to open it on.
@@ -143,7 +147,11 @@ class Window:
         self._model = build_model(config, visual=True)
         self._data = mujoco.MjData(self._model)
         self._viewer = mujoco.viewer.launch_passive(
-            self._model, self._data, show_left_ui=False, show_right_ui=False
+            self._model,
+            self._data,
+            key_callback=on_key,
+            show_left_ui=False,
+            show_right_ui=False,
         )
         self._viewer.cam.fixedcamid = self._model.camera("main").id
         self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -162,6 +170,17 @@ class Window:
             now = time.monotonic()
             self._next = max(now, self._next + self._pause)
             time.sleep(self._next - now)
+
+    def write(self, *texts: tuple[int, str, str]) -> None:
+        """Lays texts over the picture: corner (`mujoco.mjtGridPos`), left and right column."""
+        if self.is_open:
+            big = mujoco.mjtFontScale.mjFONTSCALE_150
+            self._viewer.set_texts([(big, *text) for text in texts])
+
+    @property
+    def is_open(self) -> bool:
+        """Whether nobody has closed it."""
+        return self._viewer.is_running()
 
     def close(self) -> None:
         """Closes the window."""
@@ -187,7 +206,8 @@ def _check_display() -> None:
     if not window:
         reason = str(said[-1].message) if said else "unknown reason"
         raise RenderError(
-            f"no window can be opened here ({reason}); render_mode 'rgb_array' needs no display"
+            f"no window can be opened here ({reason}); render_mode 'rgb_array' and "
+            "`mjx-balance evaluate --video` need no display"
         )
     glfw.destroy_window(window)
 

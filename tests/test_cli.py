@@ -315,3 +315,61 @@ def test_a_policy_stands_on_its_own_robot_alone(capsys: pytest.CaptureFixture[st
     assert "trained for robot 'quadruped' (15.2 kg), and go1 is another one (12.7 kg" in said
     flags = ["--scenarios", "1", "--duration", "1"]
     assert main(["evaluate", str(SHIPPED), "--robot", "quadruped", *flags]) == 0
+
+
+class StubWindow:
+    """Shows three decisions and is closed, having pressed two keys."""
+
+    def __init__(self, config: Any, on_key: Any):
+        self.shown, self.said, self.on_key = [], [], on_key
+
+    @property
+    def is_open(self) -> bool:
+        return len(self.shown) < 3
+
+    def write(self, *texts: Any) -> None:
+        self.said.append(texts)
+
+    def play(self, states: np.ndarray) -> None:
+        self.shown.append(states)
+        self.on_key(262)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_view_shows_a_policy_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    windows: list[StubWindow] = []
+
+    def opened(*arguments: Any) -> StubWindow:
+        windows.append(StubWindow(*arguments))
+        return windows[0]
+
+    monkeypatch.setattr("mjx_balance.render.Window", opened)
+    assert main(["view", "best"]) == 0
+    (window,) = windows
+    assert [x.shape for x in window.shown] == [(50, 21)] * 3
+    assert "falls" in window.said[0][0][1]
+    assert "arrows: tilt the board" in window.said[0][1][1]
+    assert window.closed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ((), "name a policy file or --controller NAME"),
+        (("nobody",), "no policy file at nobody; `mjx-balance train` writes one, and best"),
+        (("best", "--suite", "sea"), "unknown suite 'sea'"),
+        (("--controller", "pd-imu", "--robot", "rex"), "robot is 'rex'"),
+        (("best",), "no window can be opened here"),
+    ],
+)
+def test_what_cannot_be_viewed_is_said(
+    arguments: tuple[str, ...],
+    named: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert named in refuse(capsys, "view", *arguments)

@@ -30,7 +30,7 @@ FLOORS = (
     ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner", "onnx_export"),
     ("engines", "engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
-    ("engines.mjx", "engines.compiled", "evaluation", "inspection", "boards"),
+    ("engines.mjx", "engines.compiled", "evaluation", "inspection", "boards", "viewing"),
     ("engines.warp",),
     ("engines.choice",),
     ("env",),
@@ -54,7 +54,7 @@ FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
     "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
     "controllers evaluation inspection statistics render report display onnx_export boards "
-    "gym_registration gym_envs runtime".split()
+    "gym_registration gym_envs runtime viewing".split()
 )
 """With everything in them."""
 WITHOUT_JAX_TOO = {"dqn", "dqn.heads", "engines", "engines.mujoco"}

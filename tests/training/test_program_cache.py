@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import bodies
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -189,13 +190,26 @@ def test_every_other_number_changes_the_key(monkeypatch: pytest.MonkeyPatch) -> 
     for (*section, name), value in places:
         if name in NOT_TRACED:
             continue
-        change: dict[str, Any] = {name: f"{value} and more"}
+        change: dict[str, Any] = {name: "go1" if name == "robot" else f"{value} and more"}
         if section:
             inner = dataclasses.replace(getattr(CONFIG, section[0]), **change)
             change = {section[0]: inner}
         keys.add(key(dataclasses.replace(CONFIG, **change)))
         count += 1
     assert len(keys) == count > 60
+
+
+def test_another_model_of_a_robot_changes_the_key(tmp_path: Path) -> None:
+    """Its file and its name are the same."""
+    spec = bodies.our_spec()
+    keys = set()
+    for mass in (6.92, 7.0):
+        spec.body("trunk").mass = mass
+        spec.compile()
+        (tmp_path / "model.xml").write_text(spec.to_xml())
+        (tmp_path / "rex.toml").write_text(bodies.file_text(Path("model.xml")))
+        keys.add(key(dataclasses.replace(CONFIG, robot=str(tmp_path / "rex.toml"))))
+    assert len(keys) == 2
 
 
 @pytest.mark.parametrize(
