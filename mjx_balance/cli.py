@@ -190,10 +190,16 @@ def _train(argv: list[str]) -> int:
         return _complain("--resume continues a folder in place; leave --run-dir out")
 
     engine = parsed.config.engine
-    with quiet_imports("torch", *(["warp"] if engine != "warp" else [])):
-        from jax.errors import JaxRuntimeError
+    try:
+        with quiet_imports("torch", *(["warp"] if engine != "warp" else [])):
+            from jax.errors import JaxRuntimeError
 
-        from mjx_balance.training import devices, processes, run
+            from mjx_balance.training import devices, processes, run
+    except ModuleNotFoundError as error:
+        return _complain(
+            f"training needs {(error.name or '').partition('.')[0]}, which is not installed; "
+            "`pip install 'mjx-balance[train]'` brings what it needs"
+        )
     from mjx_balance.display import Display
     from mjx_balance.training.checkpoints import CheckpointError
 
