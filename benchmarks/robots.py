@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from markers import publish, table
+from PIL import Image, ImageDraw
 from throughput import hardware
 
 from mjx_balance import load_policy, render
@@ -33,6 +34,7 @@ SUITES = ("paper", "corner", "push")
 PEERS = ("pd-imu", "rate-oracle")
 DURATION = 60.0
 TIMES = "times.json"
+THUMB = (400, 225)
 
 
 def trained(robot: str, policies: Path, preset: str) -> Path:
@@ -82,6 +84,19 @@ def measured(robot: str, path: Path, scenarios: int, pictures: Path | None) -> l
     return row
 
 
+def gallery(robots: list[str], pictures: Path, out: Path) -> None:
+    """One picture of all robots, three in a row, each with its name."""
+    rows = -(-len(robots) // 3)
+    sheet = Image.new("RGB", (3 * THUMB[0], rows * THUMB[1]))
+    pen = ImageDraw.Draw(sheet)
+    for k, name in enumerate(robots):
+        corner = (k % 3 * THUMB[0], k // 3 * THUMB[1])
+        with Image.open(pictures / f"{name}.png") as picture:
+            sheet.paste(picture.convert("RGB").resize(THUMB), corner)
+        pen.text((corner[0] + 12, corner[1] + 8), name, fill=(30, 40, 50), font_size=20)
+    sheet.save(out, quality=88)
+
+
 def main() -> None:
     """Trains, measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
@@ -90,15 +105,17 @@ def main() -> None:
     parser.add_argument("--preset", default="best")
     parser.add_argument("--scenarios", type=int, default=256)
     parser.add_argument("--pictures", type=Path, help="folder for a PNG of each robot")
+    parser.add_argument("--gallery", type=Path, help="JPEG of all of them, with --pictures")
     parser.add_argument("--write", type=Path, help="Markdown file with markers")
     args = parser.parse_args()
     rows = [
         measured(x, trained(x, args.policies, args.preset), args.scenarios, args.pictures)
         for x in args.robots
     ]
-    cells = [
-        f"`{suite}`: policy / {' / '.join(f'`{x}`' for x in PEERS)}; to oracle" for suite in SUITES
-    ]
+    if args.gallery:
+        gallery(args.robots, args.pictures, args.gallery)
+    names = " / ".join(f"`{x}`" for x in PEERS)
+    cells = [f"`{suite}`: policy / {names}; to oracle" for suite in SUITES]
     columns = ["robot", "mass", "height", "training", *cells]
     machine = hardware()
     note = (

@@ -90,6 +90,8 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
     """
     robot = find_robot(config.robot)
     stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
+    for looked in (*stage.cameras, *stage.worldbody.geoms):  # from as far as it is large
+        looked.pos = looked.pos * robot.size_scale
     height = config.task.body_height
     stage.attach(_board(robot), prefix=BOARD, frame=stage.worldbody.add_frame())
     body = robot_spec(config.robot, visual)

@@ -85,6 +85,24 @@ def test_it_moves_alike_however_it_is_drawn(drawing: str, scene: Scene) -> None:
     np.testing.assert_allclose(other.course, ours.course, atol=0.01)
 
 
+def test_its_feet_are_where_mujoco_sees_them_however_it_is_drawn(drawing: str) -> None:
+    """At any angles, abduction to either side included."""
+    scene, rng = scene_of(drawing), np.random.default_rng(0)
+    data = mujoco.MjData(scene.model)
+    standing = joint_angles(scene.robot, np.full(4, 0.33))
+    for _ in range(10):
+        angles = standing + rng.uniform(-0.4, 0.4, (4, 3))
+        below = -feet_of(scene, data, angles)[:, 2] + 0.022
+        np.testing.assert_allclose(foot_heights(scene.robot, angles), below, atol=1e-6)
+
+
+def test_nothing_but_its_servos_moves_a_joint(drawing: str) -> None:
+    model = scene_of(drawing).model
+    assert not model.jnt_stiffness.any()
+    assert not model.dof_frictionloss.any()
+    assert not model.jnt_actfrclimited.any()
+
+
 def test_it_is_seen_alike_however_it_is_drawn(drawing: str, scene: Scene) -> None:
     """A controller that looks at the IMU alone holds it level: wrong axes or signs would not."""
     other = scene_of(drawing)
