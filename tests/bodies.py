@@ -75,10 +75,20 @@ def drawn_standing(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     return spec
 
 
+def high_shoulders(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Abduction axes 30 mm above the trunk's origin, hips 20 mm below these."""
+    for leg in LEGS:
+        for part, z in (("hip", 0.03), ("thigh", -0.02)):
+            body = spec.body(f"{leg}_{part}")
+            body.pos = [*body.pos[:2], z]
+    return spec
+
+
 def with_motors(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """Torque motors in another order, on geared shafts, and feet on bodies of their own.
 
-    A floor, a lamp, a keyframe, contacts, joints with friction and springs, other options.
+    A floor, a lamp, a keyframe, contacts, joints with friction and springs, other options, an IMU
+    mounted askew.
     """
     for servo in [*spec.actuators, *spec.sensors]:
         spec.delete(servo)
@@ -108,4 +118,5 @@ def with_motors(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     spec.worldbody.add_light(pos=[0, 0, 3])
     spec.add_key(name="home", qpos=[0, 0, 0.3, 1, 0, 0, 0] + [0.0, 0.8, -1.6] * 4)
     spec.option.timestep, spec.option.impratio = 0.001, 100
+    spec.site("imu").quat = [0.6, 0, 0, 0.8]
     return spec

@@ -96,6 +96,42 @@ def test_its_feet_are_where_mujoco_sees_them_however_it_is_drawn(drawing: str) -
         np.testing.assert_allclose(foot_heights(scene.robot, angles), below, atol=1e-6)
 
 
+def test_shoulders_and_hips_at_other_heights(tmp_path: Path) -> None:
+    """Feet 10 mm nearer to the trunk's origin, all angles being the same."""
+    name = written(tmp_path, bodies.high_shoulders(bodies.our_spec()))
+    robot, ours = find_robot(name), find_robot("quadruped")
+    assert (robot.legs[0].axis_height, robot.legs[0].drop) == pytest.approx((0.03, 0.02))
+    assert robot.height_range == pytest.approx([x - 0.01 for x in ours.height_range])
+    assert robot.body_height == pytest.approx(0.34, abs=1e-3)
+    scene, rng = scene_of(name), np.random.default_rng(0)
+    data = mujoco.MjData(scene.model)
+    standing = joint_angles(robot, np.full(4, 0.34))
+    np.testing.assert_allclose(standing, joint_angles(ours, np.full(4, 0.35)), atol=1e-9)
+    angles = standing + rng.uniform(-0.4, 0.4, (4, 3))
+    below = -feet_of(scene, data, angles)[:, 2] + 0.022
+    np.testing.assert_allclose(foot_heights(robot, angles), below, atol=1e-6)
+
+
+def test_a_hips_limits_limit_the_reach(tmp_path: Path) -> None:
+    """A thigh that leans back by 0.6 rad at most, half the knee's turn: 0.426 cos 0.6 + 0.022."""
+    spec = bodies.our_spec()
+    for leg in bodies.LEGS:
+        spec.joint(f"{leg}_hip").range = [-1.5, 0.6]
+    text = bodies.file_text(Path("model.xml"), body_height="0.39")
+    robot = find_robot(written(tmp_path, spec, text))
+    assert robot.height_range[0] == pytest.approx(0.426 * np.cos(0.6) + 0.022, abs=1e-3)
+    assert robot.legs[0].knee == pytest.approx((-1.2, -0.838), abs=2e-3)
+
+
+def test_the_reach_is_that_of_all_legs(robot: Robot) -> None:
+    """One leg cannot fold as far, another not stretch as far."""
+    legs = list(robot.legs)
+    legs[1] = dataclasses.replace(legs[1], knee=(-2.0, -0.838))
+    legs[2] = dataclasses.replace(legs[2], knee=(-2.72, -1.2))
+    low, high = dataclasses.replace(robot, legs=tuple(legs)).height_range
+    assert (low, high) == pytest.approx((0.426 * np.cos(1.0) + 0.022, 0.426 * np.cos(0.6) + 0.022))
+
+
 def test_nothing_but_its_servos_moves_a_joint(drawing: str) -> None:
     model = scene_of(drawing).model
     assert not model.jnt_stiffness.any()

@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import bodies
 import mujoco
@@ -19,7 +20,13 @@ MAKERS = tuple(name for name in shipped() if name != "quadruped")
 def drafted(spec: mujoco.MjSpec, folder: Path) -> tuple[str, Robot]:
     """Text and robot of a draft from a model."""
     spec.compile()
-    (folder / "model.xml").write_text(spec.to_xml())
+    tree = ElementTree.fromstring(spec.to_xml())
+    for body in [x for x in tree.iter("body") if x.find("body[@name='arm0']") is not None]:
+        arm = body.find("body[@name='arm0']")
+        assert arm is not None
+        body.remove(arm)
+        body.insert(0, arm)  # before the legs
+    (folder / "model.xml").write_bytes(ElementTree.tostring(tree))
     text = draft("model.xml", folder / "model.xml")
     return text, build(parse_robot_file(text, folder / "drafted.toml"))[1]
 
@@ -87,6 +94,8 @@ def test_one_that_looks_along_y(tmp_path: Path, robot: Robot) -> None:
     text, found = drafted(bodies.turned(bodies.our_spec(), 90), tmp_path)
     assert "# Looks along its y" in text
     assert (found.half_length, found.half_track) == pytest.approx((0.193, 0.142))
+    for leg in found.legs:
+        assert (leg.name[1] == "L", leg.name[0] == "F") == (leg.left, leg.front)
 
 
 def test_what_is_no_quadruped_is_refused(tmp_path: Path) -> None:
