@@ -5,20 +5,28 @@ import types
 import numpy as np
 import pytest
 from mujoco.batch import Batch
+from scipy.spatial.transform import Rotation
 
-from mjx_balance.config import Config, RandomizationConfig
+from mjx_balance.config import RandomizationConfig, fitted, preset
 from mjx_balance.model_fields import model_fields
 from mjx_balance.robots import Robot
-from mjx_balance.scene import Scene
+from mjx_balance.scene import Scene, load_scene
 from mjx_balance.task.randomization import DRAWS, draw_conditions
 
 WORST = RandomizationConfig(payload=8.0, payload_offset=0.1, friction_min=0.3, gain_spread=0.3)
 
 
+@pytest.fixture(params=("quadruped", "go2"))
+def any_scene(request: pytest.FixtureRequest) -> Scene:
+    """Go2's trunk has principal axes that are not its frame's."""
+    return load_scene(fitted(preset("default"), request.param))
+
+
 def test_inverse_weights_are_those_that_mujoco_computes(
-    xp: types.ModuleType, config: Config, robot: Robot, scene: Scene
+    xp: types.ModuleType, any_scene: Scene
 ) -> None:
     """MJX takes them as they are; they scale every contact and limit."""
+    scene, robot = any_scene, any_scene.robot
     uniform = np.random.default_rng(0).uniform(size=(5, DRAWS))
     batch = Batch(scene.model, 5, 1)
     plain = model_fields(scene, draw_conditions(WORST, robot, uniform))
@@ -34,7 +42,24 @@ def test_inverse_weights_are_those_that_mujoco_computes(
         np.testing.assert_allclose(np.asarray(got[name]), values, rtol=rtol, atol=1e-7)
 
 
-def test_without_a_payload_nothing_changes(config: Config, robot: Robot, scene: Scene) -> None:
+def test_a_payload_by_full_tensors_in_the_trunks_own_axes() -> None:
+    """Go2's: turned by a quarter about y, nearly; the products about its principal axes go."""
+    scene = load_scene(fitted(preset("default"), "go2"))
+    load = draw_conditions(WORST, scene.robot, np.full(DRAWS, 0.8))
+    trunk = scene.model.body("robot/base")
+    mass, added, at = trunk.mass[0], float(load.payload), load.payload_at
+    axes = Rotation.from_quat(trunk.iquat, scalar_first=True).as_matrix()
+    centre = (mass * trunk.ipos + added * at) / (mass + added)
+    whole = axes @ np.diag(trunk.inertia) @ axes.T
+    for weight, place in ((mass, trunk.ipos), (added, at)):
+        arm = place - centre
+        whole = whole + weight * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    got = model_fields(scene, load)["body_inertia"][trunk.id]
+    np.testing.assert_allclose(got, np.diag(axes.T @ whole @ axes), rtol=1e-9)
+
+
+def test_without_a_payload_nothing_changes(any_scene: Scene) -> None:
+    scene, robot = any_scene, any_scene.robot
     uniform = np.full((1, DRAWS), 0.5)
     fields = model_fields(scene, draw_conditions(RandomizationConfig(), robot, uniform))
     for name, values in fields.items():

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_balance.config import Config, greatest_incline
+from mjx_balance.config import Config, fitted, greatest_incline, preset
 from mjx_balance.robots import Robot
 from mjx_balance.suites import (
     SEEDS,
@@ -202,3 +202,14 @@ def test_every_suite_follows_the_configs_incline(config: Config) -> None:
     for name, suite in SUITES.items():
         if not suite.steep:
             assert np.abs(make_scenarios(flat, name, 20, 60, 0)[0].targets).max() <= 2.0
+
+
+def test_loads_and_kicks_go_with_the_robot() -> None:
+    """B2 is 5.493 times as heavy as ours, and 1.702 times as long."""
+    config = fitted(preset("default"), "b2")
+    _, conditions = make_scenarios(config, "payload", 200, 1.0, 0)
+    assert conditions.payload.max() == pytest.approx(5 * 5.493, rel=0.03)
+    assert np.abs(conditions.payload_at[:, :2]).max() == pytest.approx(0.05 * 1.702, rel=0.03)
+    speeds = np.linalg.norm(make_pushes(config, "push", 100, 60.0, 0).kicks, axis=-1)
+    limits = (speeds.min(), speeds.max())
+    assert limits == pytest.approx((0.2 * 1.702, 0.4 * 1.702), rel=0.01)
