@@ -7,8 +7,9 @@ BIN := $(VENV)/bin
 comma := ,
 RUNTIME := $(VENV)/.installed-$(EXTRAS)
 DEV := $(VENV)/.installed-dev-$(EXTRAS)
+DOCS := $(VENV)/.installed-docs
 
-.PHONY: train test check bench bugs format clean
+.PHONY: train test check docs bench bugs format clean
 
 train: $(RUNTIME)
 	$(BIN)/python train.py $(ARGS)
@@ -21,6 +22,10 @@ check: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+docs: $(DOCS)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs site $(ARGS)
+	@echo site/index.html
+
 bench: $(RUNTIME)
 	$(BIN)/python benchmarks/throughput.py $(ARGS)
 
@@ -32,7 +37,7 @@ format: $(DEV)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) site
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -45,4 +50,8 @@ $(RUNTIME): $(BIN)/python pyproject.toml constraints.txt
 
 $(DEV): $(BIN)/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev$(if $(EXTRAS),$(comma)$(EXTRAS))]"
+	@touch $@ $(RUNTIME)
+
+$(DOCS): $(BIN)/python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	@touch $@ $(RUNTIME)
