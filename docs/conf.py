@@ -13,6 +13,10 @@ from sphinx.util import logging
 
 REPO = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(REPO))
+from mjx_balance.quiet import quiet_imports  # noqa: E402
+
+with quiet_imports("torch", "warp"):  # MJX prints that it finds no Warp
+    import mjx_balance.env  # noqa: F401
 
 project = html_title = "mjx_balance"
 author, copyright = "the authors of mjx_balance", "the authors of mjx_balance, Apache-2.0"
@@ -98,6 +102,8 @@ def setup(app: Sphinx) -> None:
     ) -> None:
         if what in ("attribute", "data", "property"):
             lines[:] = whole[name]
+        made = ("Alias for field number", "Create new instance of")  # by typing.NamedTuple
+        lines[:] = [line for line in lines if not line.startswith(made)]
 
     def on_source(app: Sphinx, name: str, text: list[str]) -> None:
         text[0] = to_the_site(text[0])
