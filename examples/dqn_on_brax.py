@@ -65,7 +65,8 @@ def held_out(learner: Learner, state: Any, episodes: int = 64) -> jax.Array:
 
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], jax.Array]:
         env_state, up = carry
-        best = jnp.argmax(learner.network.apply(params, env_state.obs), axis=-1)
+        values = jnp.asarray(learner.network.apply(params, env_state.obs))
+        best = values.argmax(axis=-1)
         env_state = jax.vmap(env.step)(env_state, best)
         up &= ~((env_state.done > 0) & (env_state.info["truncation"] == 0))
         return (env_state, up), up

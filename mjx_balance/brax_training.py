@@ -33,9 +33,7 @@ def wrap(
     """
     longest = env.config.task.episode_length
     if episode_length > longest:
-        raise ValueError(
-            f"episode_length is {episode_length}; scenarios are of {longest} decisions"
-        )
+        raise ValueError(f"episode_length is {episode_length}; scenarios end after {longest}")
     if randomization_fn is not None:
         raise ValueError("randomization_fn is given; BalanceEnv randomises by its config instead")
     return _NewScenarios(EpisodeWrapper(VmapWrapper(_Endless(env)), episode_length, action_repeat))

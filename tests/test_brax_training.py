@@ -108,17 +108,14 @@ def test_after_its_end_an_episode_is_as_after_a_reset(env: BalanceEnv, states: l
     ends = [(n, k) for n, state in enumerate(states) for k in np.flatnonzero(state.done)]
     assert len(ends) >= LIFTING * 2 + STANDING * 2
 
-    def same(a: np.ndarray, b: np.ndarray, k: int) -> None:
-        np.testing.assert_array_equal(a[k], b[k])
+    def parts(state: Any, k: Any) -> list[Any]:
+        own = [state.info[name] for name in ("memory", "decision", "decisions_left")]
+        return [leaf[k] for leaf in jax.tree.leaves((state.pipeline_state, state.obs, own))]
 
     for n, k in ends:
         state = states[n]
-        for name in ("pipeline_state", "obs"):
-            jax.tree.map(
-                lambda a, b, k=k: same(a, b, k), getattr(state, name), getattr(fresh, name)
-            )
-        for name in ("memory", "decision", "decisions_left"):
-            jax.tree.map(lambda a, b, k=k: same(a, b, k), state.info[name], fresh.info[name])
+        for ours, expected in zip(parts(state, k), parts(fresh, k), strict=True):
+            np.testing.assert_array_equal(ours, expected)
         before, after = (s.info["scenario"] for s in (states[n - 1], state))
         assert before.phase[k] != after.phase[k]
         assert (before.targets[k] != after.targets[k]).any()
@@ -167,7 +164,7 @@ def test_braxs_own_wrapping_would_not_do(env: BalanceEnv) -> None:
 
 
 def test_what_brax_cannot_have_is_refused(env: BalanceEnv) -> None:
-    with pytest.raises(ValueError, match="episode_length is 9; scenarios are of 8 decisions"):
+    with pytest.raises(ValueError, match="episode_length is 9; scenarios end after 8"):
         wrap(env, EPISODE + 1)
     with pytest.raises(ValueError, match="BalanceEnv randomises by its config"):
         wrap(env, EPISODE, randomization_fn=lambda sys: (sys, sys))
