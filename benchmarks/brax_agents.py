@@ -9,6 +9,7 @@ by itself.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import itertools
 import multiprocessing
@@ -104,14 +105,13 @@ def brax_rows(name: str, budgets: Sequence[float], seed: int) -> Iterator[dict[s
         # SAC shows its parameters in files alone; those of PPO, brax 0.14 cannot read back.
         show = {"ppo": {"policy_params_fn": keep}, "sac": {"checkpoint_logdir": folder}}[name]
         more = show | {"num_evals": MOST + 1, "progress_fn": look}
-        try:
+        with contextlib.suppress(Enough):
             example["train"](name, env, MOST * EVERY, seed, **more)
-        except Enough:
-            compiling, found = marks(looks)
+        compiling, found = marks(looks)
         for budget in budgets:
             mark = reached(found, budget)
             path = Path(folder) / f"{mark.decisions:012d}"
-            policy = kept.get(mark.decisions) or checkpoint.load_policy(path)
+            policy = kept.get(mark.decisions) or checkpoint.load_policy(str(path))
             acting = example["controller"](env, policy)
             yield row(name, budget, compiling, mark, judged(env.scene, acting))
 
@@ -132,7 +132,7 @@ def our_rows(name: str, budgets: Sequence[float], seed: int) -> Iterator[dict[st
     learner = make_learner(config, env)
     calls = config.num_env_steps // config.log_every
     state = learner.init(seed)
-    program = learner.train_program(config.log_every // learner.num_envs)
+    program: Any = learner.train_program(config.log_every // learner.num_envs)
     began = time.perf_counter()
     run = program.lower(state).compile()
     compiling, spent = time.perf_counter() - began, 0.0
