@@ -55,17 +55,19 @@ def marks(looks: Sequence[tuple[int, float]]) -> tuple[float, list[Mark]]:
     """Tells compiling from training.
 
     Args:
-      looks: decisions, and seconds since the start of training; at least two. The first of the
-        equal stretches between them also compiles.
+      looks: decisions, and seconds since the start of training, after equal numbers of decisions;
+        at least four. brax compiles in the first stretch, and once more in the second, whose
+        arguments come from a program.
 
     Returns:
-      Seconds of compiling: what the first stretch took beyond the median of the others; and the
-      marks without them.
+      Seconds of compiling: what two stretches took beyond twice the median of the others; and
+      the marks without them.
     """
     times = [seconds for _, seconds in looks]
-    usual = statistics.median(b - a for a, b in itertools.pairwise(times))
-    compiling = times[0] - usual
-    return compiling, [Mark(decisions, seconds - compiling) for decisions, seconds in looks]
+    usual = statistics.median(b - a for a, b in itertools.pairwise(times[1:]))
+    compiling = times[1] - 2 * usual
+    spent = [usual, *(seconds - compiling for seconds in times[1:])]
+    return compiling, [Mark(*pair) for pair in zip((n for n, _ in looks), spent, strict=True)]
 
 
 def reached(found: Sequence[Mark], seconds: float) -> Mark:
@@ -98,7 +100,7 @@ def brax_rows(name: str, budgets: Sequence[float], seed: int) -> Iterator[dict[s
     def look(decisions: int, metrics: dict[str, Any]) -> None:
         if "training/walltime" in metrics:
             looks.append((decisions, float(metrics["training/walltime"])))
-        if len(looks) > 2 and marks(looks)[1][-1].seconds >= max(budgets):
+        if len(looks) > 4 and marks(looks)[1][-1].seconds >= max(budgets):
             raise Enough
 
     with tempfile.TemporaryDirectory() as folder:
