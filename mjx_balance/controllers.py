@@ -49,7 +49,7 @@ class View(NamedTuple):
 
 
 Controller = Callable[[View], np.ndarray]
-"""Maps what there is to see of n scenarios to action indices (n,)."""
+"""Maps what there is to see of n scenarios to action indices (n,), or to a_x and a_y (n, 2), m."""
 
 
 class ControllerError(ValueError):

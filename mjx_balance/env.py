@@ -1,4 +1,4 @@
-"""`BalanceEnv`: one robot on one board, a brax environment with 441 discrete actions."""
+"""`BalanceEnv`: one robot on one board, a brax environment with 441 or with continuous actions."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from mjx_balance.engines.choice import make_engine
 from mjx_balance.engines.engine import Engine, settled
 from mjx_balance.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt
-from mjx_balance.task.actions import action_table
+from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.observation import observation_names
 from mjx_balance.task.pushes import Pushes, draw_kicks, kick, kicked_decisions
 from mjx_balance.task.randomization import DRAWS, draw_conditions
@@ -27,18 +27,22 @@ class BalanceEnv(Env):
     that `done * (1 - truncation)` marks true terminations. A done env is not reset
     by `step`: the observation it returns is the one before the reset.
 
-    Written for one board; `jax.vmap` it over thousands.
+    Written for one board; `jax.vmap` it over thousands. For brax's own trainers:
+    `brax_training.wrap`.
     """
 
-    def __init__(self, config: Config | None = None):
+    def __init__(self, config: Config | None = None, action: str = "discrete"):
         """Builds the scene.
 
         Args:
           config: the preset "default" if none.
+          action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
+            `action_max`, -1 to 1.
 
         Raises:
-          ConfigError: if the config cannot be run.
+          ConfigError: if the config cannot be run, or for another kind of action.
         """
+        self._discrete = check_action(action) == "discrete"
         self.config = check(config or preset("default"))
         self.scene: Scene = load_scene(self.config)
         self._engine: Engine = make_engine(self.scene)
@@ -53,17 +57,17 @@ class BalanceEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """Number of discrete actions."""
-        return self.config.task.num_actions
+        """Number of discrete actions, or of the numbers that make a continuous one."""
+        return self.config.task.num_actions if self._discrete else ACTION_AXES
 
     @property
     def action_factors(self) -> tuple[int, ...]:
-        """The action index as a mixed-radix number: levels of roll, levels of pitch."""
+        """A discrete action as a mixed-radix number: levels of roll, levels of pitch."""
         return (self.config.task.action_levels,) * ACTION_AXES
 
     @property
     def symmetries(self) -> Symmetries:
-        """How observations and actions look in a mirror."""
+        """How observations and discrete actions look in a mirror."""
         return symmetries(self.config.task, self.scene.robot)
 
     @property
@@ -125,14 +129,14 @@ class BalanceEnv(Env):
 
         Args:
           state: from `reset` or `step`.
-          action: () action index, 0 to action_size - 1.
+          action: () action index, 0 to action_size - 1; or (2,), clipped to -1 to 1.
 
         Returns:
           The state `ctrl_dt` later.
         """
         task, robot = self.config.task, self.scene.robot
         info: dict[str, Any] = state.info
-        change = jnp.asarray(self._table)[action]
+        change = self._change(action)
         conditions = info.get("conditions")
         late = None if conditions is None else conditions.latency > 0
         memory, targets = decision.controls(
@@ -173,6 +177,12 @@ class BalanceEnv(Env):
             metrics=state.metrics | metrics,
             info=info,
         )
+
+    def _change(self, action: jax.Array) -> jax.Array:
+        """Height changes (2,) of an action, m."""
+        if self._discrete:
+            return jnp.asarray(self._table)[action]
+        return self.config.task.action_max * jnp.clip(action, -1.0, 1.0)
 
     def _scenario(self, key: jax.Array) -> tilt.Scenario:
         """Draws the targets, and the age of the first."""

@@ -104,7 +104,7 @@ class _Trials:
         late = self.late[alive]
         qpos, qvel = self.engine.state(alive)
         chosen = controller(View(alive, number, self.obs, self.samples, qpos, qvel, some, late))
-        change = self.table[chosen]
+        change = chosen if chosen.ndim == 2 else self.table[chosen]
         now = np.full(len(alive), float(number))
         memory, targets = decision.controls(task, robot, self.memory, change, late, some, now)
         if self.pushes is not None:
@@ -179,7 +179,7 @@ def roll_out(
 
     Args:
       scene: task, model and stance.
-      controller: chooses action indices.
+      controller: chooses action indices or height changes.
       scenarios: targets (n, k, 2), phase (n,), rate (n,).
       duration: s, rounded up to whole decisions.
       threads: worker threads; all cores if none.

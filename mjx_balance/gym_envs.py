@@ -16,21 +16,17 @@ from mjx_balance.config import Config, ConfigError, TaskConfig, shown
 from mjx_balance.config import preset as find_preset
 from mjx_balance.render import Painter, Window
 from mjx_balance.robots import Robot
-from mjx_balance.task.actions import action_table
+from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.decision import ABSURD
 from mjx_balance.task.observation import observation_scale
-
-ACTIONS = ("discrete", "continuous")
 
 
 class _Actions:
     """What a board may be told, and what that means."""
 
     def __init__(self, task: TaskConfig, kind: str):
-        if kind not in ACTIONS:
-            raise ConfigError(f"action is {shown(kind)}; it must be one of {', '.join(ACTIONS)}")
         self._most = task.action_max
-        self._table = action_table(task) if kind == "discrete" else None
+        self._table = action_table(task) if check_action(kind) == "discrete" else None
         self.space: spaces.Space = (
             spaces.Discrete(len(self._table))
             if self._table is not None

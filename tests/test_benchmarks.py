@@ -469,3 +469,12 @@ def test_products_are_rounded_forward_and_backward(
     np.testing.assert_array_equal(by_kernel[:, 0], (kept * kept, 2.0**-12 * kept))
     np.testing.assert_array_equal(by_x, (kept, kept))
     assert float(value(kernel, x)) != float(whole)
+
+
+def test_compiling_is_no_part_of_the_time_that_brax_trains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stretches of 22 and 12 s where the others take 2, but for one that was disturbed."""
+    module = load("brax_agents", monkeypatch)
+    compiling, found = module.marks([(10, 22.0), (20, 34.0), (30, 41.0), (40, 43.0), (50, 45.0)])
+    assert compiling == pytest.approx(30)
+    assert [mark.seconds for mark in found] == pytest.approx([2, 4, 11, 13, 15])
+    assert [module.reached(found, t).decisions for t in (1, 2, 5, 12, 99)] == [10, 10, 30, 40, 50]

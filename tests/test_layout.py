@@ -35,7 +35,7 @@ FLOORS = (
     ("engines.choice",),
     ("env",),
     ("render", "display", "report"),
-    ("gym_envs",),
+    ("gym_envs", "brax_training"),
     ("report.figures", "report.tables", "report.digest"),
     ("report.reading",),
     ("report.measuring",),

@@ -1,10 +1,20 @@
-"""The 21 x 21 actions of paper Eq. 3."""
+"""The 21 x 21 actions of paper Eq. 3, or any height change up to theirs."""
 
 import numpy as np
 
-from mjx_balance.config import TaskConfig
+from mjx_balance.config import ConfigError, TaskConfig, shown
 from mjx_balance.robots import Robot
 from mjx_balance.task import Array
+
+ACTIONS = ("discrete", "continuous")
+"""An index into `action_table`; or a_x and a_y as shares of `action_max`, -1 to 1."""
+
+
+def check_action(kind: str) -> str:
+    """Returns one of `ACTIONS`; raises `ConfigError` for anything else."""
+    if kind not in ACTIONS:
+        raise ConfigError(f"action is {shown(kind)}; it must be one of {', '.join(ACTIONS)}")
+    return kind
 
 
 def action_table(task: TaskConfig) -> np.ndarray:
