@@ -268,6 +268,8 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluation, "run_suite", few)
     monkeypatch.setattr(evaluation, "policy_scene", found)
     monkeypatch.setattr(render, "write", drawn)
+    shut = types.SimpleNamespace(is_open=False, close=lambda: None)
+    monkeypatch.setattr(render, "Window", lambda *arguments: shut)
     monkeypatch.setattr(run, "train", train)
     monkeypatch.setattr(cli, "read_run_config", lambda path: config.preset("default"))
     monkeypatch.setattr(cli, "_video", filmed)
