@@ -200,7 +200,7 @@ def test_braxs_trainers_learn_to_balance(algorithm: str) -> None:
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:Brax System")
 def test_our_learner_balances_braxs_pendulum() -> None:
-    """A pole that nobody holds is down within a second, 25 decisions."""
+    """An untrained network keeps poles up for 9 of 1,000 decisions, 34 at most."""
     example = runpy.run_path(str(EXAMPLES / "dqn_on_brax.py"))
     learner, state = example["train"](example["pendulum"](), 60_000, 0)
     assert example["held_out"](learner, learner.init(0)).mean() < 100
