@@ -70,7 +70,7 @@ def measured(robot: str, path: Path, scenarios: dict[str, int], out: Path) -> li
     scene = policy_scene(policy)
     row = [f"`{robot}`", f"{policy.robot.total_mass:.1f} kg"]
     row += [f"{1000 * policy.config.task.body_height:.0f} mm"]
-    row += [f"{times(path.parent)[robot]:.0f} s"]
+    row += [f"{times(path.parent)[robot]:.0f} s", ""]
     for suite, count in scenarios.items():
         means, cells = {}, []
         for name in ("policy", *PEERS):
@@ -86,6 +86,7 @@ def measured(robot: str, path: Path, scenarios: dict[str, int], out: Path) -> li
             means[name] = found["mean"]
             fell = f" ({found['falls']} of {found['scenarios']} fall)" if found["falls"] else ""
             cells.append(f"{found['mean']:.3f}{fell}")
+        row[4] += f"{', ' if row[4] else ''}{own[f'{suite}, policy']['scenarios']}"
         row.append(" / ".join(cells) + f"; {means['policy'] / means['rate-oracle']:.2f}")
     return row
 
@@ -123,13 +124,13 @@ def main() -> None:
         gallery(policies, args.gallery)
     names = " / ".join(f"`{x}`" for x in ("policy", *PEERS))
     cells = [f"`{suite}`: {names}; to oracle" for suite in SUITES]
-    columns = ["robot", "mass", "height", "training", *cells]
+    columns = ["robot", "mass", "height", "training", "scenarios", *cells]
     machine = hardware()
     note = (
         f"Preset `{args.preset}`, engine `mujoco`, one seed; {machine['cpu']}, {machine['cores']} "
-        f"cores. Mean tilt in deg over {args.scenarios} held-out scenarios of {DURATION:.0f} s, a "
-        "quarter of them in `push` (or as said); no falls but those said; last, the policy's mean "
-        "over `rate-oracle`'s."
+        f"cores. Mean tilt in deg over so many held-out scenarios of {DURATION:.0f} s in "
+        f"{', '.join(SUITES)}; no falls but those said; last, the policy's mean over that of "
+        "`rate-oracle`."
     )
     publish("robots", [*table(columns, rows), "", note], args.write)
 

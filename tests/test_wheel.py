@@ -38,6 +38,8 @@ def test_what_is_in_it(wheel: Path) -> None:
     wanted = {"py.typed", "runtime.py", "policies/best.safetensors", "report/page.html"}
     wanted |= {f"scenes/{name}.xml" for name in ("board", "quadruped", "scene")}
     wanted |= {f"robots/{name}.toml" for name in shipped()}
+    makers = set(shipped()) - {"quadruped"}
+    wanted |= {f"policies/robots/{name}.safetensors" for name in makers}
     wanted = {f"mjx_balance/{name}" for name in wanted}
     assert wanted <= names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "docs/"))]
