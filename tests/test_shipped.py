@@ -10,7 +10,9 @@ from mjx_balance.evaluation import evaluate, policy_scene
 from mjx_balance.scene import Scene
 from mjx_balance.suites import make_scenarios
 
-POLICIES = sorted((Path(__file__).parent.parent / "policies").rglob("*.safetensors"))
+FOLDER = Path(__file__).parent.parent / "policies"
+POLICIES = sorted((*FOLDER.glob("*.safetensors"), *FOLDER.glob("seeds/*.safetensors")))
+"""Of our own robot; test_shipped_robots.py has those of others."""
 
 
 def test_there_is_a_best_policy_and_its_seeds() -> None:
