@@ -532,7 +532,9 @@ def test_no_display_gives_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     env = BalanceGymEnv(render_mode="human")
-    with pytest.raises(RenderError, match=r"no window can be opened here .* 'rgb_array' and .* need no"):
+    with pytest.raises(
+        RenderError, match=r"no window can be opened here .* 'rgb_array' and .* need no"
+    ):
         env.reset()
 
 
