@@ -13,18 +13,15 @@ import tyro
 from rich.console import Console
 
 from mjx_balance import evaluation
-from mjx_balance.config import Config, ConfigError, check, fitted, preset
+from mjx_balance.config import Config, check, fitted, preset
 from mjx_balance.controllers import Controller, ControllerError, make_controller
-from mjx_balance.exit_codes import FAILED, INTERRUPTED, USAGE_ERROR
+from mjx_balance.errors import FAILED, INTERRUPTED, USAGE_ERROR, InputError
 from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
-from mjx_balance.run_folder import RunFolderError, read_run_config
+from mjx_balance.run_folder import read_run_config
 from mjx_balance.scene import Scene, load_scene
-from mjx_balance.suites import SuiteError
 
 COMMANDS = ("train", "sweep", "evaluate", "report", "export", "view", "robot")
-REFUSED = (PolicyError, evaluation.EvaluationError, SuiteError, ControllerError, ConfigError)
-"""What is wrong with the input of those who watch a policy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +147,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "view": _view,
         "robot": _robot,
     }
-    return commands[argv[0]](argv[1:])
+    try:
+        return commands[argv[0]](argv[1:])
+    except InputError as error:
+        return _complain(str(error))
+    except OSError as error:
+        return _complain(f"cannot write {error.filename or 'all of it'}: {error.strerror}")
+    except KeyboardInterrupt:
+        return INTERRUPTED
 
 
 def _sweep(argv: list[str]) -> int:
@@ -178,13 +182,10 @@ def _train(argv: list[str]) -> int:
     early.add_argument("--robot", default="quadruped")
     early.add_argument("--resume", type=Path)
     known, _ = early.parse_known_args(argv)
-    try:
-        if known.resume is None:
-            default = TrainArgs(config=fitted(preset(known.preset), known.robot))
-        else:
-            default = TrainArgs(config=read_run_config(known.resume))
-    except ValueError as error:
-        return _complain(str(error))
+    if known.resume is None:
+        default = TrainArgs(config=fitted(preset(known.preset), known.robot))
+    else:
+        default = TrainArgs(config=read_run_config(known.resume))
     parsed = tyro.cli(TrainArgs, args=argv, prog="mjx-balance train", default=default)
     if parsed.resume and parsed.run_dir:
         return _complain("--resume continues a folder in place; leave --run-dir out")
@@ -201,7 +202,6 @@ def _train(argv: list[str]) -> int:
             "`pip install 'mjx-balance[train]'` brings what it needs"
         )
     from mjx_balance.display import Display
-    from mjx_balance.training.checkpoints import CheckpointError
 
     display = Display()
     try:
@@ -212,12 +212,7 @@ def _train(argv: list[str]) -> int:
             if place.index:
                 display = Display(Console(quiet=True))
         run.train(parsed.config, parsed.run_dir, parsed.resume, display, place, parsed.profile)
-    except (ConfigError, RunFolderError, CheckpointError, processes.ProcessError) as error:
-        return _complain(str(error))
-    except processes.ProcessLostError as error:
-        _complain(str(error))
-        return FAILED
-    except PolicyError as error:
+    except (processes.ProcessLostError, PolicyError) as error:
         _complain(str(error))
         return FAILED
     except JaxRuntimeError as error:
@@ -231,8 +226,6 @@ def _train(argv: list[str]) -> int:
         return FAILED
     except run.Interrupted as stopped:
         display.say(str(stopped))
-        return INTERRUPTED
-    except KeyboardInterrupt:
         return INTERRUPTED
     return 0
 
@@ -257,37 +250,30 @@ def _evaluate(argv: list[str]) -> int:
     from mjx_balance.report.tables import evaluation_table
 
     display = Display(Console(stderr=True))
-    try:
-        for path in (args.json, args.video):
-            if path is not None and not path.absolute().parent.is_dir():
-                return _complain(f"cannot write {path}: its folder does not exist")
-        if args.video is not None and args.video.suffix != ".mp4":
-            return _complain(f"video is {args.video}; its name must end in .mp4")
-        scene, controller = _who_acts(args.policy, args.controller, args.robot)
-        with display.bar(f"evaluating, suite {args.suite}") as bar:
-            rollout = evaluation.run_suite(
-                scene,
-                controller,
-                args.suite,
-                args.scenarios,
-                args.duration,
-                args.seed,
-                bar,
-            )
-        result = evaluation.summarize(rollout, args.suite, args.duration, args.seed)
-        if args.json:
-            args.json.write_text(json.dumps(result, indent=2) + "\n")
-        Console().print(evaluation_table({args.suite: result}))
-        speed = result["physics_steps_per_second"]
-        print(f"{speed:,.0f} physics steps per second")
-        if args.video:
-            return _video(scene, controller, args)
-    except REFUSED as error:
-        return _complain(str(error))
-    except OSError as error:
-        return _complain(f"cannot write {error.filename}: {error.strerror}")
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    for path in (args.json, args.video):
+        if path is not None and not path.absolute().parent.is_dir():
+            return _complain(f"cannot write {path}: its folder does not exist")
+    if args.video is not None and args.video.suffix != ".mp4":
+        return _complain(f"video is {args.video}; its name must end in .mp4")
+    scene, controller = _who_acts(args.policy, args.controller, args.robot)
+    with display.bar(f"evaluating, suite {args.suite}") as bar:
+        rollout = evaluation.run_suite(
+            scene,
+            controller,
+            args.suite,
+            args.scenarios,
+            args.duration,
+            args.seed,
+            bar,
+        )
+    result = evaluation.summarize(rollout, args.suite, args.duration, args.seed)
+    if args.json:
+        args.json.write_text(json.dumps(result, indent=2) + "\n")
+    Console().print(evaluation_table({args.suite: result}))
+    speed = result["physics_steps_per_second"]
+    print(f"{speed:,.0f} physics steps per second")
+    if args.video:
+        return _video(scene, controller, args)
     return 0
 
 
@@ -311,22 +297,13 @@ def _video(scene, controller, args: EvaluateArgs) -> int:
 def _report(argv: list[str]) -> int:
     args = tyro.cli(ReportArgs, args=argv, prog="mjx-balance report")
     from mjx_balance.display import Display
-    from mjx_balance.evaluation import EvaluationError
     from mjx_balance.report.page import write_report
-    from mjx_balance.report.reading import ReportError
 
     if not args.run_dirs:
         return _complain("name at least one run folder")
     out = args.out or args.run_dirs[0] / "report.html"
     display = Display(Console(stderr=True))
-    try:
-        missing = write_report(args.run_dirs, out, args.scenarios, display.bar)
-    except (ReportError, EvaluationError) as error:
-        return _complain(str(error))
-    except OSError as error:
-        return _complain(f"cannot write {error.filename}: {error.strerror}")
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    missing = write_report(args.run_dirs, out, args.scenarios, display.bar)
     for sentence in missing:
         print(f"mjx-balance: {sentence}", file=sys.stderr)
     print(out)
@@ -339,17 +316,10 @@ def _export(argv: list[str]) -> int:
         return _complain(f"out is {args.out}; its name must end in .onnx")
     try:
         from mjx_balance.onnx_export import OPSET, export_onnx
-
-        policy = load_policy(args.policy)
-        size = export_onnx(policy, args.out)
     except ImportError as error:
         return _complain(f"export needs the package onnx, as of pip install onnx: {error}")
-    except PolicyError as error:
-        return _complain(str(error))
-    except OSError as error:
-        return _complain(f"cannot write {args.out}: {error.strerror}")
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    policy = load_policy(args.policy)
+    size = export_onnx(policy, args.out)
     print(f"{args.out}: {size / 1000:,.1f} kB, opset {OPSET}")
     print(
         f"observation (N, {policy.observation_size}) float32 -> "
@@ -364,11 +334,11 @@ def _view(argv: list[str]) -> int:
 
     from mjx_balance import render, viewing
 
+    scene, controller = _who_acts(args.policy, args.controller, args.robot)
+    session = viewing.Session(scene, controller, args.suite, args.seed)
     try:
-        scene, controller = _who_acts(args.policy, args.controller, args.robot)
-        session = viewing.Session(scene, controller, args.suite, args.seed)
         window = render.Window(scene.config, session.press)
-    except (*REFUSED, render.RenderError) as error:
+    except render.RenderError as error:
         return _complain(str(error))
     corners = mujoco.mjtGridPos
     keys = "Enter: kick" if args.suite else viewing.HELP
@@ -379,8 +349,6 @@ def _view(argv: list[str]) -> int:
                 (corners.mjGRID_BOTTOMLEFT, keys, ""),
             )
             window.play(session.decide())
-    except KeyboardInterrupt:
-        return INTERRUPTED
     finally:
         window.close()
     return 0
@@ -398,10 +366,7 @@ def _robot_check(argv: list[str]) -> int:
     args = tyro.cli(RobotCheckArgs, args=argv, prog="mjx-balance robot check")
     from mjx_balance import inspection, render
 
-    try:
-        scene, tilted = inspection.find_out(args.robot)
-    except ConfigError as error:
-        return _complain(str(error))
+    scene, tilted = inspection.find_out(args.robot)
     print("\n".join(inspection.described(scene, tilted)))
     picture = args.picture or Path(f"{scene.robot.name.replace(':', '_')}.png")
     try:
@@ -415,28 +380,22 @@ def _robot_check(argv: list[str]) -> int:
 
 def _robot_new(argv: list[str]) -> int:
     args = tyro.cli(RobotNewArgs, args=argv, prog="mjx-balance robot new")
-    from mjx_balance.robots import RobotError
     from mjx_balance.robots.building import model_path
     from mjx_balance.robots.draft import draft
 
-    try:
-        path = model_path(args.model, Path())
-        model = args.model
-        if args.out is not None:
-            if args.out.exists():
-                return _complain(f"{args.out} exists already")
-            if path == Path(model):
-                model = os.path.relpath(path, args.out.parent)
-        text = draft(model, path)
-        if args.out is None:
-            print(text, end="")
-        else:
-            args.out.write_text(text)
-            print(f"{args.out}: see `mjx-balance robot check {args.out}`")
-    except RobotError as error:
-        return _complain(str(error))
-    except OSError as error:
-        return _complain(f"cannot write {error.filename}: {error.strerror}")
+    path = model_path(args.model, Path())
+    model = args.model
+    if args.out is not None:
+        if args.out.exists():
+            return _complain(f"{args.out} exists already")
+        if path == Path(model):
+            model = os.path.relpath(path, args.out.parent)
+    text = draft(model, path)
+    if args.out is None:
+        print(text, end="")
+    else:
+        args.out.write_text(text)
+        print(f"{args.out}: see `mjx-balance robot check {args.out}`")
     return 0
 
 

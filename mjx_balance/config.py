@@ -16,6 +16,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
+from mjx_balance.errors import InputError
 from mjx_balance.robots import Robot, RobotError, find_robot
 
 T = TypeVar("T")
@@ -23,7 +24,7 @@ T = TypeVar("T")
 ACTION_AXES = 2  # roll and pitch, paper Eq. 3
 
 
-class ConfigError(ValueError):
+class ConfigError(InputError):
     """A config that cannot be run; the message names the field and a remedy."""
 
 
@@ -372,7 +373,7 @@ def preset(name: str) -> Config:
 def fitted(config: Config, robot: str) -> Config:
     """`config`, of our own robot, for another: what depends on mass and size goes along.
 
-    Standing height and greatest height change are the robot's own (`robots.building`). Angles, the
+    Standing height and greatest height change are the robot's own (`robots.measuring`). Angles, the
     board's rate and the fall limit stay the paper's.
 
     Raises:

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.config import ACTION_AXES
+from mjx_balance.errors import InputError
 from mjx_balance.scene import Scene
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.actions import nearest_action
@@ -52,7 +53,7 @@ Controller = Callable[[View], np.ndarray]
 """Maps what there is to see of n scenarios to action indices (n,), or to a_x and a_y (n, 2), m."""
 
 
-class ControllerError(ValueError):
+class ControllerError(InputError):
     """An unknown controller; the message lists the known ones."""
 
 

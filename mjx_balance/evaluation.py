@@ -16,6 +16,7 @@ import psutil
 from mjx_balance.config import RandomizationConfig, TaskConfig, greatest_incline
 from mjx_balance.controllers import Controller, View
 from mjx_balance.engines.mujoco import Motion, MujocoEngine
+from mjx_balance.errors import InputError
 from mjx_balance.policy import Policy, PolicyError
 from mjx_balance.robots import RobotError, find_robot
 from mjx_balance.scene import Scene, load_scene
@@ -34,7 +35,7 @@ TILT_COPIES = 3
 """Arrays of every scenario's tilt at every step that a summary needs at once, float64."""
 
 
-class EvaluationError(ValueError):
+class EvaluationError(InputError):
     """An evaluation that cannot be run; the message says why."""
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_balance.config import Config, check, fitted, greatest_incline, preset
 from mjx_balance.robots import Robot
-from mjx_balance.robots.building import UNLIMITED
+from mjx_balance.robots.measuring import UNLIMITED
 from mjx_balance.scene import Scene, load_scene
 from mjx_balance.suites import authority
 from mjx_balance.task.attitude import body_tilt

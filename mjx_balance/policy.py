@@ -28,6 +28,7 @@ from mjx_balance.config import (
     to_dict,
 )
 from mjx_balance.dqn import heads
+from mjx_balance.errors import InputError
 from mjx_balance.robots import Robot, find_robot, robot_from_dict
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
@@ -42,7 +43,7 @@ MOST_MANIFEST = 4 * 2**20
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 
 
-class PolicyError(ValueError):
+class PolicyError(InputError):
     """A policy file that cannot be used; the message says what is wrong with it."""
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_balance.config import Config, check, flatten, from_dict, to_dict
+from mjx_balance.errors import InputError
 
 if sys.platform == "win32":
     import msvcrt
@@ -27,7 +28,7 @@ SAID_AT_MOST = 300
 """Characters of another's error that a message repeats."""
 
 
-class RunFolderError(ValueError):
+class RunFolderError(InputError):
     """A run folder that cannot be used; the message says why and what would do."""
 
 
@@ -127,9 +128,10 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
-    except OSError:
+    except OSError as error:
         with contextlib.suppress(OSError):
             part.unlink()
+        error.filename = str(path)  # what the user knows of
         raise
 
 

@@ -7,13 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from mjx_balance.config import Config, RandomizationConfig, greatest_incline, scaled_to
+from mjx_balance.errors import InputError
 from mjx_balance.robots import find_robot
 from mjx_balance.task import tilt
 from mjx_balance.task.pushes import Pushes, draw_kicks, kicked_decisions
 from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
 
 
-class SuiteError(ValueError):
+class SuiteError(InputError):
     """A suite that does not exist, or does not suit the config; the message says why."""
 
 

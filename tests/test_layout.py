@@ -10,10 +10,9 @@ import mjx_balance
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
 
 FLOORS = (
-    (
-        *"exit_codes quiet sources gym_registration runtime".split(),
-        *("robots.record", "robots.file"),
-    ),
+    tuple("errors quiet sources gym_registration runtime".split()),
+    ("robots.record", "robots.file"),
+    ("robots.measuring",),
     ("robots.building",),
     ("robots.draft",),
     ("robots",),
@@ -52,7 +51,7 @@ FLOORS = (
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 WITHOUT_JAX = set(
-    "robots config exit_codes quiet sources task scene model_fields suites policy run_folder "
+    "robots config errors quiet sources task scene model_fields suites policy run_folder "
     "controllers evaluation inspection statistics render report display onnx_export boards "
     "gym_registration gym_envs runtime viewing".split()
 )

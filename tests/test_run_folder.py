@@ -1,5 +1,6 @@
 """A run's folder: whole at every moment, refused in one sentence where it cannot be used."""
 
+import errno
 import json
 import os
 import signal
@@ -63,11 +64,12 @@ def test_a_failed_write_leaves_the_old_file(
     file.write_text("old")
 
     def full(number: int) -> None:
-        raise OSError("the disk is full")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="full"):
+    with pytest.raises(OSError, match="No space left") as error:
         write_atomically(file, "new")
+    assert error.value.filename == str(file), "not a name that nobody has given"
     assert file.read_text() == "old"
     assert os.listdir(tmp_path) == ["file.json"]
 

@@ -11,6 +11,7 @@ from reprlib import repr as short
 from typing import Any
 
 from mjx_balance.config import Config, check, from_dict
+from mjx_balance.errors import InputError
 from mjx_balance.policy import Policy, load_policy
 from mjx_balance.report.figures import CURVES, HELD_OUT
 from mjx_balance.run_folder import RunFolder, parse_json, read_json
@@ -32,7 +33,7 @@ FOREIGN = (
 """What reading a file that a run did not write may raise."""
 
 
-class ReportError(ValueError):
+class ReportError(InputError):
     """A report that cannot be made, or a file that cannot be used; the message says why."""
 
 

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.robots.building import ancestors, read_model
+from mjx_balance.robots.building import read_model
 from mjx_balance.robots.file import RobotError
+from mjx_balance.robots.measuring import ancestors
 
 HEADER = """\
 # Drafted from the model's structure; a corner's letters say front or rear, left or right.

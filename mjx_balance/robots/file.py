@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mjx_balance.errors import InputError
 
-class RobotError(ValueError):
+
+class RobotError(InputError):
     """A robot that cannot be found, read or built; the message says what is wrong with it."""
 
 

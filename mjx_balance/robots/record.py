@@ -60,7 +60,7 @@ class Leg:
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """Measured on the compiled model by `building.measured`; legs in observation order."""
+    """Measured on the compiled model by `measuring.measured`; legs in observation order."""
 
     name: str
     """Its file's."""

@@ -13,6 +13,7 @@ from typing import TypeVar, cast
 
 import orbax.checkpoint as ocp
 
+from mjx_balance.errors import InputError
 from mjx_balance.training.processes import ALONE, Processes, ProcessLostError
 
 T = TypeVar("T")
@@ -21,7 +22,7 @@ KEPT = 2
 """Newest checkpoints that are kept: one, and one to fall back on."""
 
 
-class CheckpointError(ValueError):
+class CheckpointError(InputError):
     """Checkpoints that cannot be written, or of which none is whole; the message says where."""
 
 

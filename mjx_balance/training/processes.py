@@ -22,7 +22,7 @@ from typing import Any, NoReturn, TypeVar, cast
 
 import jax
 
-from mjx_balance.exit_codes import FAILED, INTERRUPTED
+from mjx_balance.errors import FAILED, INTERRUPTED, InputError
 
 T = TypeVar("T")
 
@@ -32,7 +32,7 @@ SILENCE_S = 30
 """Time after which a machine that answers nothing counts as gone."""
 
 
-class ProcessError(ValueError):
+class ProcessError(InputError):
     """Processes that cannot work together; the message says why."""
 
 
