@@ -66,18 +66,19 @@ class Rollout:
         return self.fell_at < self.tilt.shape[1]
 
 
-class _Trials:
+class Trials:
     """Scenarios under way; owns the physics and the memories of those that still stand."""
 
     def __init__(
         self,
         scene: Scene,
         scenarios: tilt.Scenario,
-        conditions: Conditions | None,
-        pushes: Pushes | None,
-        noise_seed: int,
-        threads: int | None,
+        conditions: Conditions | None = None,
+        pushes: Pushes | None = None,
+        noise_seed: int = 0,
+        threads: int | None = None,
     ):
+        """Puts a robot on each board; see `roll_out` for the arguments."""
         count = len(scenarios.phase)
         self.scene, self.task, self.scenarios = scene, scene.config.task, scenarios
         self.pushes = pushes
@@ -98,7 +99,7 @@ class _Trials:
         angles = self.engine.state(self.alive)[0][:, scene.leg_qpos]
         self.obs = decision.observation(self.task, scene.robot, self.memory, angles)
 
-    def decide(self, controller: Controller, number: int) -> "_Decision":
+    def decide(self, controller: Controller, number: int) -> "Decision":
         """Lets the controller take decision `number` wherever the robot stands."""
         task, robot, alive = self.task, self.scene.robot, self.alive
         some = tilt.Scenario(*(x[alive] for x in self.scenarios))
@@ -120,16 +121,19 @@ class _Trials:
         down = outcome.fell | motion.warned
         self.memory = decision.Memory(*(x[~down] for x in memory))
         self.samples, self.obs, self.alive = samples[~down], outcome.obs[~down], alive[~down]
-        return _Decision(alive, 1000 * np.abs(change).mean(axis=-1), motion, down)
+        return Decision(alive, 1000 * np.abs(change).mean(axis=-1), motion, down)
 
 
-class _Decision(NamedTuple):
-    """One decision of n scenarios."""
+class Decision(NamedTuple):
+    """One decision of the n scenarios whose robot stood until then."""
 
     ids: np.ndarray
+    """(n,)"""
     action_mm: np.ndarray
+    """(n,) mean of the two axes' height changes, mm."""
     motion: Motion
     down: np.ndarray
+    """(n,) whether the robot has fallen."""
 
 
 class _Record:
@@ -143,7 +147,7 @@ class _Record:
         self.fell_at = np.full(count, steps)
         self.qpos = np.tile(scene.stance.qpos, (count, steps, 1)) if keep_qpos else None
 
-    def add(self, number: int, made: _Decision) -> None:
+    def add(self, number: int, made: Decision) -> None:
         """Writes decision `number` down."""
         sim_steps = self.task.sim_steps
         ids, motion, down = made.ids, made.motion, made.down
@@ -193,9 +197,19 @@ def roll_out(
     Returns:
       The rollout of n scenarios.
     """
-    decisions = int(np.ceil(duration / scene.config.task.ctrl_dt - 1e-9))
-    trials = _Trials(scene, scenarios, conditions, pushes, noise_seed, threads)
-    kept = _Record(scene, len(scenarios.phase), decisions, record)
+    trials = Trials(scene, scenarios, conditions, pushes, noise_seed, threads)
+    return _rolled_out(trials, controller, duration, record, progress)
+
+
+def _rolled_out(
+    trials: Trials,
+    controller: Controller,
+    duration: float,
+    record: bool,
+    progress: Callable[[float], None],
+) -> Rollout:
+    decisions = int(np.ceil(duration / trials.task.ctrl_dt - 1e-9))
+    kept = _Record(trials.scene, len(trials.alive), decisions, record)
     began = time.perf_counter()
     for number in range(decisions):
         kept.add(number, trials.decide(controller, number))
@@ -339,18 +353,23 @@ def run_suite(
       SuiteError: as `make_scenarios`.
     """
     check_fits(scene.config.task, scenarios, duration, scene.model.nq if record else 0)
+    trials = suite_trials(scene, suite, scenarios, duration, seed)
+    return _rolled_out(trials, controller, duration, record, progress)
+
+
+def suite_trials(
+    scene: Scene,
+    suite: str,
+    scenarios: int,
+    duration: float,
+    seed: int,
+    threads: int | None = None,
+) -> Trials:
+    """A suite's scenarios, boards level and robots standing; raises as `make_scenarios`."""
     drawn, conditions = make_scenarios(scene.config, suite, scenarios, duration, seed)
-    return roll_out(
-        scene,
-        controller,
-        drawn,
-        duration,
-        record=record,
-        progress=progress,
-        conditions=conditions if find_suite(suite).randomization != RandomizationConfig() else None,
-        pushes=make_pushes(scene.config, suite, scenarios, duration, seed),
-        noise_seed=seed,
-    )
+    varied = find_suite(suite).randomization != RandomizationConfig()
+    pushes = make_pushes(scene.config, suite, scenarios, duration, seed)
+    return Trials(scene, drawn, conditions if varied else None, pushes, seed, threads)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,13 +5,11 @@ import math
 import numpy as np
 
 from mjx_balance.config import greatest_incline
-from mjx_balance.controllers import Controller, View
-from mjx_balance.engines.mujoco import MujocoEngine
+from mjx_balance.controllers import Controller
+from mjx_balance.evaluation import Trials, suite_trials
 from mjx_balance.scene import Scene
-from mjx_balance.suites import make_pushes, make_scenarios
-from mjx_balance.task import decision, tilt
-from mjx_balance.task.actions import action_table
-from mjx_balance.task.pushes import kick
+from mjx_balance.task import tilt
+from mjx_balance.task.pushes import Pushes
 
 STEP = 1.0
 """By which a key turns where the board is to go, deg."""
@@ -33,34 +31,28 @@ class Session:
         Args:
           scene: model, stance and task.
           controller: acts.
-          suite: whose targets and kicks the board follows; none: the keys'.
+          suite: whose targets, kicks and circumstances these are; none: the keys'.
           seed: of that scenario, and of the directions of kicks.
 
         Raises:
           SuiteError: if there is no such suite.
         """
         self.scene, self.task, self.controller = scene, scene.config.task, controller
-        self.engine = MujocoEngine(scene, 1, threads=1)
-        self.table = action_table(self.task)
+        self.suite, self.seed = suite, seed
         self.most = greatest_incline(self.task, scene.robot)
         self.rng = np.random.default_rng(seed)
-        self.followed = None
-        if suite is not None:
-            long = self.task.episode_length * self.task.ctrl_dt
-            drawn, _ = make_scenarios(scene.config, suite, 1, long, seed)
-            self.followed = drawn, make_pushes(scene.config, suite, 1, long, seed)
         self.falls = 0
         self._start()
 
     def _start(self) -> None:
-        still = self.scene.stance.imu[None]
-        self.engine.start(np.arange(1))
-        self.memory = decision.start(self.task, self.scene.robot, still)
-        self.samples = np.tile(still[:, None], (1, self.task.sim_steps, 1))
+        if self.suite is None:
+            self.trials = Trials(self.scene, self._keyed(np.zeros((2, 2)), 0), threads=1)
+        else:
+            long = self.task.episode_length * self.task.ctrl_dt
+            self.trials = suite_trials(self.scene, self.suite, 1, long, self.seed, threads=1)
+        self.pushes = self.trials.pushes or Pushes(np.zeros((1, 0, 2)), np.zeros(0, int))
         self.target, self.board = np.zeros(2), np.zeros(2)
         self.kicked, self.number, self.tilt = np.zeros(2), 0, 0.0
-        angles = self.engine.state(np.arange(1))[0][:, self.scene.leg_qpos]
-        self.obs = decision.observation(self.task, self.scene.robot, self.memory, angles)
 
     def press(self, key: int) -> None:
         """Takes a key, by GLFW's code: the camera looks along the robot from behind its right."""
@@ -77,41 +69,29 @@ class Session:
 
     def decide(self) -> np.ndarray:
         """One decision; returns the states (sim_steps, nq) that it passes through."""
-        task, robot, one = self.task, self.scene.robot, np.arange(1)
-        scenario, now = self._scenario()
-        qpos, qvel = self.engine.state(one)
-        late = np.zeros(1, bool)
-        view = View(one, self.number, self.obs, self.samples, qpos, qvel, scenario, late)
-        change = self.table[self.controller(view)]
-        memory, targets = decision.controls(task, robot, self.memory, change, None, scenario, now)
-        self.engine.push(one, self.kicked[None])
-        motion = self.engine.advance(one, self.scene.ctrl(targets))
-        angles = motion.qpos[:, -1][:, self.scene.leg_qpos]
-        self.memory, outcome = decision.outcome(
-            task, robot, memory, motion.imu, motion.tilt, angles
+        if self.suite is None:
+            way = np.stack((self.board, self.target))
+            self.trials.scenarios = self._keyed(way, self.number)
+        kicked, self.kicked = self.kicked, np.zeros(2)  # before another key may come
+        self.trials.pushes = Pushes(
+            np.concatenate((self.pushes.kicks, kicked[None, None]), axis=1),
+            np.append(self.pushes.at, self.number),
         )
-        self.board = np.degrees(targets.board[0, -1])
-        self.samples, self.obs, self.kicked = motion.imu, outcome.obs, np.zeros(2)
-        self.number, self.tilt = self.number + 1, float(outcome.tilt[0, -1])
-        if outcome.fell[0] or motion.warned[0] or self._over():
-            self.falls += bool(outcome.fell[0] or motion.warned[0])
+        made = self.trials.decide(self.controller, self.number)
+        self.number += 1
+        now = np.asarray([[self.number * self.task.ctrl_dt]])
+        self.board = tilt.board_angle(self.task, self.trials.scenarios, now)[0, 0]
+        self.tilt = float(made.motion.tilt[0, -1])
+        over = self.suite is not None and self.number >= self.task.episode_length
+        if made.down[0] or over:
+            self.falls += bool(made.down[0])
             self._start()
-        return motion.qpos[0]
+        return made.motion.qpos[0]
 
-    def _over(self) -> bool:
-        return self.followed is not None and self.number >= self.task.episode_length
-
-    def _scenario(self) -> tuple[tilt.Scenario, np.ndarray]:
-        """Where the board goes in this decision, and when that is, in decisions."""
-        if self.followed is not None:
-            drawn, pushes = self.followed
-            self.kicked = self.kicked + kick(pushes, self.number)[0]
-            return drawn, np.asarray([float(self.number)])
-        # Two targets, the first reached a moment ago: from here on to where it is to go.
-        targets = np.stack((self.board, self.target))[None]
-        phase = np.asarray([self.task.target_period])
-        rate = np.asarray([self.task.board_rate])
-        return tilt.Scenario(targets, phase, rate), np.zeros(1)
+    def _keyed(self, way: np.ndarray, number: int) -> tilt.Scenario:
+        """A board that turns from `way[0]` to `way[1]` (2, 2), deg, from decision `number` on."""
+        phase = self.task.target_period - number * self.task.ctrl_dt
+        return tilt.Scenario(way[None], np.asarray([phase]), np.asarray([self.task.board_rate]))
 
     def caption(self) -> tuple[str, str]:
         """What is shown beside the robot: names and values, a line each."""

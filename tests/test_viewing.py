@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from mjx_balance.controllers import Controller, make_controller
+from mjx_balance.controllers import Controller, View, make_controller
 from mjx_balance.evaluation import run_suite
 from mjx_balance.scene import Scene
 from mjx_balance.suites import SuiteError
+from mjx_balance.task.tilt import board_angle
 from mjx_balance.viewing import DOWN, KICK_KEY, LEFT, LEVEL, RIGHT, UP, Session
 
 
@@ -84,15 +85,50 @@ def test_who_falls_is_put_back_up_on_a_level_board(scene: Scene) -> None:
     np.testing.assert_allclose(one.decide()[0], scene.stance.qpos, atol=1e-3)
 
 
-def test_a_suite_is_shown_as_it_is_evaluated(scene: Scene) -> None:
-    """The same states as `evaluate --suite push --seed 3`, kicks and all."""
+@pytest.mark.parametrize("suite", ["push", "payload", "noise", "latency"])
+def test_a_suite_is_shown_as_it_is_evaluated(scene: Scene, suite: str) -> None:
+    """The same states as `evaluate --suite ... --seed 3`: kicks, loads, noise and delays."""
     controller: Controller = make_controller("pd-imu", scene)
-    rollout = run_suite(scene, controller, "push", 1, 12.0, 3, record=True)
+    rollout = run_suite(scene, controller, suite, 1, 60.0, 3, record=True)
     assert rollout.qpos is not None
-    one = session(scene, "pd-imu", "push")
+    one = session(scene, "pd-imu", suite)
     one.press(RIGHT)  # is not listened to
     states = np.concatenate([one.decide() for _ in range(60)])
-    np.testing.assert_allclose(states, rollout.qpos[0], atol=1e-9)
+    np.testing.assert_allclose(states, rollout.qpos[0, : len(states)], atol=1e-9)
+
+
+def test_a_kick_by_hand_comes_beside_those_of_a_suite(scene: Scene) -> None:
+    one, other = session(scene, suite="push"), session(scene, suite="push")
+    for _ in range(8):
+        one.decide()
+        other.decide()
+    one.press(KICK_KEY)
+    root = scene.trunk_quat[0] - 3
+    ways = [np.ptp(x[:, root : root + 2], axis=0) for x in (one.decide(), other.decide())]
+    assert np.linalg.norm(ways[0]) > 4 * np.linalg.norm(ways[1])
+
+
+def test_who_acts_sees_where_the_keyed_board_goes(scene: Scene) -> None:
+    """The scenario, read at the decision's own time, is the board that MuJoCo then has."""
+    seen: list[View] = []
+    stand = make_controller("pd-attitude", scene)
+
+    def watch(view: View) -> np.ndarray:
+        seen.append(view)
+        return stand(view)
+
+    one = Session(scene, watch)
+    states = []
+    for number in range(12):
+        if number in (2, 3, 7):
+            one.press((RIGHT, DOWN, LEFT)[number % 3])
+        states.append(board(scene, one.decide())[-1])
+    told = [
+        board_angle(one.task, view.scenario, np.asarray([[(view.decision + 1) * 0.2]]))[0, 0]
+        for view in seen
+    ]
+    np.testing.assert_allclose(states, told, atol=0.05)
+    assert np.abs(told).max() >= 1
 
 
 def test_an_unknown_suite_is_refused(scene: Scene) -> None:
