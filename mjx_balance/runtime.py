@@ -10,10 +10,14 @@ This file needs nothing else of the package: copy it to the robot, beside a poli
 The targets are pure kinematics. A servo that sags under the robot's weight needs its trim added
 to them, as the simulation adds `scene.stance.leg_trim`; a servo with an integral term does not.
 
-What cannot be true makes the controller hold: the legs stay where they were last told to be, until
-`reset`, before which the robot must be back at its standing height. A loop that stops altogether is
-for the servos' own watchdog to notice.
+What cannot be true, or is no balancing any more, makes the controller hold: the legs stay where
+they were last told to be, until `reset`, before which the robot must be back at its standing
+height. A loop that stops altogether is for the servos' own watchdog to notice.
+
+Python 3.8 or newer.
 """
+
+from __future__ import annotations
 
 import enum
 import json
@@ -32,9 +36,15 @@ MOST_BYTES = 64 * 2**20
 MOST_WHOLE = 100_000
 """Of any number of a manifest: far more than any policy has."""
 GYRO_MOST = 35.0
-"""rad/s; a gyro's widest usual range is 2,000 deg/s. Balancing stays below 1."""
+"""rad/s of one sample; a gyro's widest usual range is 2,000 deg/s."""
 ACCEL_MOST = 160.0
-"""m/s^2; an accelerometer's usual range is 16 g. Balancing stays below 20."""
+"""m/s^2 of one sample; an accelerometer's usual range is 16 g."""
+WEIGHT = (0.5 * 9.81, 1.5 * 9.81)
+"""m/s^2, least and most, that the mean of a decision's samples may have; kicked, 9.2 to 11."""
+LEAN_MOST = 40.0
+"""deg by which that mean may lean. 6 deg are a fall, but a kick looks like a lean of up to 29."""
+AWAY_MOST = 0.5
+"""rad by which a joint may be off what it was told, at a decision. Kicked, it is 0.03."""
 KNEE_SLACK = 0.1
 """rad by which a knee may read beyond its stops."""
 LATE_SAMPLES = 5
@@ -45,8 +55,10 @@ class PolicyFileError(ValueError):
     """A policy file that cannot be run; the message says what is wrong with it."""
 
 
-class State(enum.StrEnum):
+class State(str, enum.Enum):
     """What a controller is doing."""
+
+    __str__ = str.__str__
 
     STANDING = "standing"
     """At its standing height, before the first sample."""
@@ -107,6 +119,9 @@ class Controller:
         self._decision_dt = _number("ctrl_dt", task["ctrl_dt"], self.sample_dt, 10)
         self.decision_samples = round(self._decision_dt / self.sample_dt)
         """IMU samples from one decision to the next."""
+        # From one fall to the other within a decision.
+        fall = math.radians(_number("fail_tilt", task["fail_tilt"], 0, 90))
+        self._turn_most = 2 * fall / self._decision_dt
         share = _number("action_ramp", task["action_ramp"], 0, 1)
         ramp_steps = max(1, round(share * self.decision_samples))
         self._share = (np.arange(1, ramp_steps + 1) / ramp_steps)[:, None]
@@ -165,8 +180,10 @@ class Controller:
     ) -> np.ndarray:
         """Takes a sample of the sensors, and says where the joints shall be until the next.
 
-        It holds if a sensor reads what none does on a robot that balances, if the IMU repeats
-        itself, if a call comes too late, or if samples come at another rate than in training.
+        It holds if a sensor reads what none can, if the IMU repeats itself, if a call comes too
+        late, or if samples come at another rate than in training. Decision by decision it also
+        holds if the robot leans, turns or weighs what none does that balances, or if a joint is far
+        from its target.
 
         Args:
           joint_positions: (legs, 3) abduction, hip and knee angles, rad, in the order of `joints`.
@@ -204,6 +221,7 @@ class Controller:
         self._check_reading()
         if self.state is State.STANDING:
             self._imu[:] = self._reading[-6:]
+            self._check_posture()
             self.state = State.BALANCING
             self._decide(now)
         else:
@@ -212,6 +230,7 @@ class Controller:
             self._since += 1
             if self._since == self.decision_samples:
                 self._check_decision(now)
+                self._check_posture()
                 self._decide(now)
         self._called = now
         self._targets = self._path[min(self._since, len(self._path) - 1)]
@@ -246,6 +265,34 @@ class Controller:
             )
         if (self._imu[self._history - 1 :] == self._imu[-1]).all():
             raise _Unsafe(f"the IMU gave the same sample {self.decision_samples + 1} times")
+
+    def _check_posture(self) -> None:
+        """Holds the samples since the last decision, and the joints, against one that balances."""
+        turn, pull = np.split(self._imu[self._history :].mean(axis=0), 2)
+        weight, turns = float(np.linalg.norm(pull)), float(np.linalg.norm(turn[:2]))
+        if not WEIGHT[0] <= weight <= WEIGHT[1]:
+            raise _Unsafe(
+                f"the accelerometer gives {weight:.3g} m/s^2 in the mean of a decision; it must be "
+                f"{WEIGHT[0]:.3g} to {WEIGHT[1]:.3g}, and 9.81 at rest"
+            )
+        lean = math.degrees(math.acos(min(max(pull[2] / weight, -1.0), 1.0)))
+        if lean > LEAN_MOST:
+            raise _Unsafe(
+                f"the accelerometer leans by {lean:.3g} deg in the mean of a decision, more than "
+                f"{LEAN_MOST:g}: the robot has fallen, or up is not its z"
+            )
+        if turns > self._turn_most:
+            raise _Unsafe(
+                f"the gyro gives {turns:.3g} rad/s about x and y in the mean of a decision, more "
+                f"than {self._turn_most:.3g}: the robot falls, or these are no rad/s"
+            )
+        away = np.abs(self._reading[:-6] - self._targets.ravel())
+        k = int(away.argmax())
+        if away[k] > AWAY_MOST:
+            name = [name for leg in self.joints for name in leg][k]
+            raise _Unsafe(
+                f"{name} is {away[k]:.3g} rad from where it was told to be, more than {AWAY_MOST:g}"
+            )
 
     def _decide(self, now: float) -> None:
         """Chooses an action; the next samples find its ramp in `_path`."""
@@ -339,7 +386,7 @@ class _Network:
                 _weight(weights, f"{name}/kernel", (n, m)),
                 _weight(weights, f"{name}/bias", (m,)),
             )
-            for name, n, m in zip(names, rows, columns, strict=True)
+            for name, n, m in zip(names, rows, columns)
         ]
 
     def greedy(self, observation: np.ndarray) -> int:
@@ -436,9 +483,7 @@ def _whole(name: str, value: Any, least: int) -> int:
 def _numbers(name: str, values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     """Finite numbers of a shape, in which none is any length."""
     array = np.asarray(values, float)
-    fits = array.ndim == len(shape) and all(
-        n in (m, None) for m, n in zip(array.shape, shape, strict=True)
-    )
+    fits = array.ndim == len(shape) and all(n in (m, None) for m, n in zip(array.shape, shape))
     if not fits or not (abs(array) < MOST_WHOLE).all():
         raise PolicyFileError(f"its {name} is not {shape} sane numbers")
     return array
