@@ -469,6 +469,13 @@ def test_who_does_not_stand_does_not_begin(rig: Rig, reading: dict[str, Any], re
     assert re.search(reason, rig.controller.reason)
 
 
+def test_one_wild_sample_is_no_fall_either(rig: Rig) -> None:
+    """Not even the last before a decision."""
+    rig.steps(100)
+    rig.step(gyro=[GYRO_MOST, 0, 0], accel=[0, -ACCEL_MOST, 0])
+    assert rig.controller.state is State.BALANCING
+
+
 @pytest.mark.parametrize(
     "reading",
     [
