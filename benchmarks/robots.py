@@ -61,7 +61,7 @@ def times(policies: Path) -> dict[str, float]:
 
 
 def measured(robot: str, path: Path, scenarios: dict[str, int], out: Path) -> list[str]:
-    """A row of the table; what `out` has of this very policy is not measured again."""
+    """A row of the table; what `out` has of this policy and as many scenarios stays as it is."""
     policy = load_policy(path)
     known: dict[str, Any] = json.loads(out.read_text()) if out.is_file() else {}
     own: dict[str, Any] = known.get(robot, {})
@@ -70,12 +70,12 @@ def measured(robot: str, path: Path, scenarios: dict[str, int], out: Path) -> li
     scene = policy_scene(policy)
     row = [f"`{robot}`", f"{policy.robot.total_mass:.1f} kg"]
     row += [f"{1000 * policy.config.task.body_height:.0f} mm"]
-    row += [f"{times(path.parent)[robot]:.0f} s", ""]
+    row.append(f"{times(path.parent)[robot]:.0f} s")
     for suite, count in scenarios.items():
         means, cells = {}, []
         for name in ("policy", *PEERS):
             key = f"{suite}, {name}"
-            if key not in own:
+            if own.get(key, {}).get("scenarios") != count:
                 acts = observing(policy) if name == "policy" else make_controller(name, scene)
                 rollout = run_suite(scene, acts, suite, count, DURATION, SEEDS.held_out)
                 mean, falls = float(rollout.tilt.mean()), int(rollout.fell.sum())
@@ -86,7 +86,6 @@ def measured(robot: str, path: Path, scenarios: dict[str, int], out: Path) -> li
             means[name] = found["mean"]
             fell = f" ({found['falls']} of {found['scenarios']} fall)" if found["falls"] else ""
             cells.append(f"{found['mean']:.3f}{fell}")
-        row[4] += f"{', ' if row[4] else ''}{own[f'{suite}, policy']['scenarios']}"
         row.append(" / ".join(cells) + f"; {means['policy'] / means['rate-oracle']:.2f}")
     return row
 
@@ -124,11 +123,11 @@ def main() -> None:
         gallery(policies, args.gallery)
     names = " / ".join(f"`{x}`" for x in ("policy", *PEERS))
     cells = [f"`{suite}`: {names}; to oracle" for suite in SUITES]
-    columns = ["robot", "mass", "height", "training", "scenarios", *cells]
-    machine = hardware()
+    columns = ["robot", "mass", "height", "training", *cells]
+    machine, numbers = hardware(), ", ".join(map(str, counts.values()))
     note = (
         f"Preset `{args.preset}`, engine `mujoco`, one seed; {machine['cpu']}, {machine['cores']} "
-        f"cores. Mean tilt in deg over so many held-out scenarios of {DURATION:.0f} s in "
+        f"cores. Mean tilt in deg over {numbers} held-out scenarios of {DURATION:.0f} s in "
         f"{', '.join(SUITES)}; no falls but those said; last, the policy's mean over that of "
         "`rate-oracle`."
     )
