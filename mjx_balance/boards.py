@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_balance.config import Config, RandomizationConfig, check
-from mjx_balance.engines.mujoco import MujocoEngine
+from mjx_balance.engines.mujoco import Motion, MujocoEngine
 from mjx_balance.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.pushes import Pushes, draw_kicks, kick, kicked_decisions
@@ -31,6 +31,55 @@ class Step(NamedTuple):
     """(n,) bool, whether a standing robot's time is up."""
     qpos: np.ndarray
     """(n, sim_steps, nq) after each physics step."""
+
+
+class Taken(NamedTuple):
+    """What came of a decision of n boards."""
+
+    memory: decision.Memory
+    motion: Motion
+    samples: np.ndarray
+    """(n, sim_steps, 6) of the IMU, noise included."""
+    outcome: decision.Outcome
+    """Whose simulation MuJoCo has warned of, has fallen."""
+
+
+def take(
+    engine: MujocoEngine,
+    ids: np.ndarray,
+    memory: decision.Memory,
+    change: np.ndarray,
+    late: np.ndarray | None,
+    scenario: tilt.Scenario,
+    now: np.ndarray,
+    kicks: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
+) -> Taken:
+    """Takes one decision: `BalanceEnv.step` without its rewards and its clock.
+
+    Args:
+      engine: holds the boards.
+      ids: (n,) of them.
+      memory: from the last decision (n, ...).
+      change: (n, 2) a_x and a_y of the actions, m.
+      late: (n,) whether actions are taken one decision late; none: nowhere.
+      scenario: where the boards go (n, ...).
+      now: (n,) decisions since the start.
+      kicks: (n, 2) m/s added to the trunks' velocities; none: no kick.
+      noise: (n, sim_steps, 6) added to the IMU's samples; none: no noise.
+    """
+    scene = engine.scene
+    task, robot = scene.config.task, scene.robot
+    memory, targets = decision.controls(task, robot, memory, change, late, scenario, now)
+    if kicks is not None:
+        engine.push(ids, kicks)
+    motion = engine.advance(ids, scene.ctrl(targets))
+    samples = motion.imu if noise is None else motion.imu + noise
+    # NaN, so that whoever diverged is seen to.
+    tilts = np.where(motion.warned[:, None], np.nan, motion.tilt)
+    angles = motion.qpos[:, -1, scene.leg_qpos]
+    memory, outcome = decision.outcome(task, robot, memory, samples, tilts, angles)
+    return Taken(memory, motion, samples, outcome)
 
 
 class Boards:
@@ -108,22 +157,24 @@ class Boards:
         Args:
           change: (n, 2) a_x and a_y of the actions, m.
         """
-        task, scene = self.config.task, self.scene
+        task, kicks, noise = self.config.task, None, None
         late = self.conditions.latency > 0 if self._randomised else None
-        memory, targets = decision.controls(
-            task, scene.robot, self._memory, change, late, self.scenario, self._decisions
-        )
         if len(self.pushes.at):
-            self._engine.push(self._all, kick(self.pushes, self._decisions[:, None]))
-        motion = self._engine.advance(self._all, scene.ctrl(targets))
-        samples = motion.imu
+            kicks = kick(self.pushes, self._decisions[:, None])
         if self._noisy:
-            noise = [rng.normal(size=samples.shape[1:]) for rng in self._rngs if rng is not None]
-            samples = samples + self.conditions.imu_noise[:, None] * np.stack(noise)
-        # NaN, so that whoever diverged is seen to.
-        tilts = np.where(motion.warned[:, None], np.nan, motion.tilt)
-        angles = motion.qpos[:, -1, scene.leg_qpos]
-        self._memory, outcome = decision.outcome(task, scene.robot, memory, samples, tilts, angles)
+            drawn = [rng.normal(size=(task.sim_steps, 6)) for rng in self._rngs if rng is not None]
+            noise = self.conditions.imu_noise[:, None] * np.stack(drawn)
+        self._memory, motion, _, outcome = take(
+            self._engine,
+            self._all,
+            self._memory,
+            change,
+            late,
+            self.scenario,
+            self._decisions,
+            kicks,
+            noise,
+        )
         self._decisions += 1
         return Step(
             obs=outcome.obs.astype(np.float32),

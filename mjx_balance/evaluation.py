@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 
+from mjx_balance.boards import take
 from mjx_balance.config import RandomizationConfig, TaskConfig, greatest_incline
 from mjx_balance.controllers import Controller, View
 from mjx_balance.engines.mujoco import Motion, MujocoEngine
@@ -101,24 +102,22 @@ class Trials:
 
     def decide(self, controller: Controller, number: int) -> "Decision":
         """Lets the controller take decision `number` wherever the robot stands."""
-        task, robot, alive = self.task, self.scene.robot, self.alive
+        alive, kicks, noise = self.alive, None, None
         some = tilt.Scenario(*(x[alive] for x in self.scenarios))
         late = self.late[alive]
         qpos, qvel = self.engine.state(alive)
         chosen = controller(View(alive, number, self.obs, self.samples, qpos, qvel, some, late))
         change = chosen if chosen.ndim == 2 else self.table[chosen]
         now = np.full(len(alive), float(number))
-        memory, targets = decision.controls(task, robot, self.memory, change, late, some, now)
         if self.pushes is not None:
-            self.engine.push(alive, kick(self.pushes, number)[alive])
-        motion = self.engine.advance(alive, self.scene.ctrl(targets))
-        samples = motion.imu
+            kicks = kick(self.pushes, number)[alive]
         if self.noisy:
-            noise = np.stack([self.rngs[k].normal(size=samples.shape[1:]) for k in alive])
-            samples = samples + self.imu_noise[alive, None] * noise
-        angles = motion.qpos[:, -1][:, self.scene.leg_qpos]
-        memory, outcome = decision.outcome(task, robot, memory, samples, motion.tilt, angles)
-        down = outcome.fell | motion.warned
+            drawn = [self.rngs[k].normal(size=(self.task.sim_steps, 6)) for k in alive]
+            noise = self.imu_noise[alive, None] * np.stack(drawn)
+        memory, motion, samples, outcome = take(
+            self.engine, alive, self.memory, change, late, some, now, kicks, noise
+        )
+        down = outcome.fell
         self.memory = decision.Memory(*(x[~down] for x in memory))
         self.samples, self.obs, self.alive = samples[~down], outcome.obs[~down], alive[~down]
         return Decision(alive, 1000 * np.abs(change).mean(axis=-1), motion, down)
