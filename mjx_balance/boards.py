@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_balance.config import Config, RandomizationConfig, check
+from mjx_balance.config import Config, check
 from mjx_balance.engines.mujoco import Motion, MujocoEngine
 from mjx_balance.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt
@@ -116,7 +116,7 @@ class Boards:
         self.scenario = tilt.Scenario(*still)
         self._rngs: list[np.random.Generator | None] = [None] * count
         ranges = config.randomization
-        self._randomised = ranges != RandomizationConfig()
+        self._randomised = ranges.varies
         self.conditions: Conditions = draw_conditions(ranges, robot, np.zeros((count, DRAWS)))
         self._noisy = ranges.gyro_noise > 0 or ranges.accel_noise > 0
         at = kicked_decisions(task, ranges, duration)

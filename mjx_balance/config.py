@@ -168,6 +168,13 @@ class RandomizationConfig:
     push_period: float = bounded(5.0, above=0)
     """Time between kicks, s (chosen)."""
 
+    @property
+    def varies(self) -> bool:
+        """Whether envs differ at all: where no payload is, its place makes no difference."""
+        shares = self.gain_spread, self.latency_share
+        sizes = self.gyro_noise, self.accel_noise, self.payload, self.push_max
+        return any((*shares, *sizes)) or (self.friction_min, self.friction_max) != (None, None)
+
 
 @dataclasses.dataclass(frozen=True)
 class DQNConfig:

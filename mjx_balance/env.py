@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
-from mjx_balance.config import ACTION_AXES, Config, RandomizationConfig, check, preset
+from mjx_balance.config import ACTION_AXES, Config, check, preset
 from mjx_balance.engines.choice import make_engine
 from mjx_balance.engines.engine import Engine, settled
 from mjx_balance.scene import Scene, load_scene
@@ -48,7 +48,7 @@ class BalanceEnv(Env):
         self._engine: Engine = make_engine(self.scene)
         self._table = action_table(self.config.task)
         ranges, task = self.config.randomization, self.config.task
-        self._randomised = ranges != RandomizationConfig()
+        self._randomised = ranges.varies
         self._kicked = kicked_decisions(task, ranges, task.episode_length * task.ctrl_dt)
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 
 from mjx_balance.boards import take
-from mjx_balance.config import RandomizationConfig, TaskConfig, greatest_incline
+from mjx_balance.config import TaskConfig, greatest_incline
 from mjx_balance.controllers import Controller, View
 from mjx_balance.engines.mujoco import Motion, MujocoEngine
 from mjx_balance.errors import InputError
@@ -366,7 +366,7 @@ def suite_trials(
 ) -> Trials:
     """A suite's scenarios, boards level and robots standing; raises as `make_scenarios`."""
     drawn, conditions = make_scenarios(scene.config, suite, scenarios, duration, seed)
-    varied = find_suite(suite).randomization != RandomizationConfig()
+    varied = find_suite(suite).randomization.varies
     pushes = make_pushes(scene.config, suite, scenarios, duration, seed)
     return Trials(scene, drawn, conditions if varied else None, pushes, seed, threads)
 

@@ -19,6 +19,7 @@ from mjx_balance.config import (
     RandomizationConfig,
     TaskConfig,
     check,
+    fitted,
     flatten,
     from_dict,
     greatest_incline,
@@ -382,6 +383,15 @@ def test_check_returns_what_it_was_given() -> None:
 def test_nothing_is_random_in_the_paper() -> None:
     assert preset("paper").randomization == RandomizationConfig()
     assert preset("default").randomization == RandomizationConfig()
+
+
+@pytest.mark.parametrize("field", dataclasses.fields(RandomizationConfig), ids=lambda x: x.name)
+def test_places_and_times_of_what_is_not_there_vary_nothing(field: dataclasses.Field[Any]) -> None:
+    """Each alone, at 0.1: another robot's, scaled to its size, differ from ours in these."""
+    alone = dataclasses.replace(RandomizationConfig(), **{field.name: 0.1})
+    idle = {"payload_offset", "payload_height", "push_min", "push_period"}
+    assert alone.varies == (field.name not in idle)
+    assert not fitted(preset("default"), "b2").randomization.varies
 
 
 def test_preset_best_sees_every_sample_of_three_decisions_once() -> None:
