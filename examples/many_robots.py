@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=shipped())
     parser.add_argument("--preset", default="best")
     parser.add_argument("--decisions", type=int, default=60_000, help="of each robot")
-    parser.add_argument("--envs", type=int, default=36, help="of each robot")
+    parser.add_argument("--envs", type=int, default=32, help="of each robot")
     parser.add_argument("--scenarios", type=int, default=64, help="to be judged by")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="folder for the policies")
