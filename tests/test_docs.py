@@ -27,8 +27,9 @@ from unittest import mock
 import mujoco_menagerie
 import pytest
 import yaml
+from brax.training.agents.ppo import train as ppo
 
-from mjx_balance import cli, config, env, evaluation, render
+from mjx_balance import brax_training, cli, config, env, evaluation, render
 from mjx_balance.engines.compiled import mujoco_engine
 from mjx_balance.report import page as report_page
 from mjx_balance.robots import find_robot, shipped
@@ -264,6 +265,13 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         args.video.write_bytes(b"")
         return 0
 
+    def train_ppo(*arguments: Any, **keywords: Any) -> Any:
+        given = trainer.bind(*arguments, **keywords).arguments
+        assert given["wrap_env_fn"] is brax_training.wrap
+        given["wrap_env_fn"](given["environment"], given["episode_length"])
+        return None, None, {}
+
+    trainer = inspect.signature(ppo.train)
     place = types.SimpleNamespace(index=0)
     monkeypatch.setattr(evaluation, "run_suite", few)
     monkeypatch.setattr(evaluation, "policy_scene", found)
@@ -271,6 +279,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     shut = types.SimpleNamespace(is_open=False, close=lambda: None)
     monkeypatch.setattr(render, "Window", lambda *arguments: shut)
     monkeypatch.setattr(run, "train", train)
+    monkeypatch.setattr(ppo, "train", train_ppo)
     monkeypatch.setattr(cli, "read_run_config", lambda path: config.preset("default"))
     monkeypatch.setattr(cli, "_video", filmed)
     monkeypatch.setattr(processes, "find_place", lambda *where: place)
@@ -329,7 +338,7 @@ DOCUMENTED = sorted(
     set(re.findall(r"automodule:: (\S+)", "".join(x.read_text() for x in API.glob("*.md"))))
 )
 WANTED = (
-    *("policy", "runtime", "env", "gym_envs", "config", "robots", "evaluation"),
+    *("policy", "runtime", "env", "brax_training", "gym_envs", "config", "robots", "evaluation"),
     *("dqn.learner", "engines.engine"),
 )
 """Modules that the API pages must have."""
