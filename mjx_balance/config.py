@@ -232,9 +232,9 @@ class DQNConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """A whole run."""
+    """A whole run. A bare one has the paper's values; `preset` returns the others by name."""
 
-    preset: str = "default"
+    preset: str = "paper"
     """Where the other values start from."""
     seed: int = bounded(0, least=0)
     """Seed of everything random."""

@@ -52,6 +52,12 @@ def test_every_preset_can_be_run_and_knows_its_name(name: str) -> None:
     assert check(preset(name)).preset == name
 
 
+def test_a_bare_config_is_preset_papers_and_says_so() -> None:
+    """But for the number of envs, which it leaves to the device."""
+    assert Config(num_envs=64) == preset("paper")
+    assert Config().num_envs is None
+
+
 def test_preset_paper_has_the_papers_numbers() -> None:
     config = preset("paper")
     task, dqn = config.task, config.dqn
