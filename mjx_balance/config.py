@@ -232,7 +232,11 @@ class DQNConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """A whole run. A bare one has the paper's values; `preset` returns the others by name."""
+    """A whole run.
+
+    A bare one has the paper's values; `preset` returns the others by name, and `fitted` makes one
+    for another robot.
+    """
 
     preset: str = "paper"
     """Where the other values start from."""
@@ -381,7 +385,8 @@ def fitted(config: Config, robot: str) -> Config:
     """`config`, of our own robot, for another: what depends on mass and size goes along.
 
     Standing height and greatest height change are the robot's own (`robots.measuring`). Angles, the
-    board's rate and the fall limit stay the paper's.
+    board's rate and the fall limit stay the paper's. To replace `robot` alone leaves it with the
+    height, the height changes and the loads of another.
 
     Raises:
       ConfigError: if there is no such robot.

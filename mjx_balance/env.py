@@ -35,7 +35,7 @@ class BalanceEnv(Env):
         """Builds the scene.
 
         Args:
-          config: the preset "default" if none.
+          config: the preset "default" if none; another robot's is made by `config.fitted`.
           action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
             `action_max`, -1 to 1.
 

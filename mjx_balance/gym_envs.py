@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from mjx_balance.boards import Boards, Step
-from mjx_balance.config import Config, ConfigError, TaskConfig, shown
+from mjx_balance.config import Config, ConfigError, TaskConfig, fitted, shown
 from mjx_balance.config import preset as find_preset
 from mjx_balance.render import Painter, Window
 from mjx_balance.robots import Robot
@@ -66,12 +66,14 @@ def _named(action: Any, array: np.ndarray | None, single: spaces.Space) -> str:
     return f"action is {shown(action)}"
 
 
-def _config(preset: str | None, config: Config | None) -> Config:
-    """The one that is named; the preset "default" if none is."""
+def _config(preset: str | None, config: Config | None, robot: str | None) -> Config:
+    """The one that is named, made for a robot; the preset "default" if none is."""
     if config is None:
-        return find_preset(preset or "default")
-    if preset is not None:
-        raise ConfigError(f"preset is {shown(preset)}, and a config is given; leave one out")
+        named = find_preset(preset or "default")
+        return named if robot is None else fitted(named, robot)
+    for name, value in (("preset", preset), ("robot", robot)):
+        if value is not None:
+            raise ConfigError(f"{name} is {shown(value)}, and a config is given; leave one out")
     return config
 
 
@@ -103,27 +105,30 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
         config: Config | None = None,
         action: str = "discrete",
         render_mode: str | None = None,
+        robot: str | None = None,
     ):
         """Builds the scene.
 
         Args:
           preset: name of the config; "default" if neither is given.
-          config: instead of a preset; its task, robot and randomisation are what counts.
+          config: instead of preset and robot; its task, robot and randomisation are what counts.
           action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
             `action_max`, -1 to 1.
           render_mode: "human", a window in which every decision takes its time; "rgb_array"; or
             none.
+          robot: as `Config.robot`, to which the preset is fitted; our own if none.
 
         Raises:
-          ConfigError: for an unknown preset or kind of action, or a config that cannot be run.
+          ConfigError: for an unknown preset, robot or kind of action, or a config that cannot be
+            run.
           UnsupportedMode: for another render mode.
         """
         _check_mode(render_mode, self.metadata["render_modes"])
-        self.boards = Boards(_config(preset, config), 1, threads=1)
-        task, robot = self.boards.config.task, self.boards.scene.robot
+        self.boards = Boards(_config(preset, config, robot), 1, threads=1)
+        task = self.boards.config.task
         self._actions = _Actions(task, action)
         self.action_space = self._actions.space
-        self.observation_space = _observations(task, robot)
+        self.observation_space = _observations(task, self.boards.scene.robot)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
         self._under_way = False
@@ -202,15 +207,17 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         config: Config | None = None,
         action: str = "discrete",
         render_mode: str | None = None,
+        robot: str | None = None,
     ):
         """Builds the scene.
 
         Args:
           num_envs: boards.
           preset: name of the config.
-          config: instead of a preset.
+          config: instead of preset and robot.
           action: "discrete" or "continuous".
           render_mode: "rgb_array", one picture for each board, or none.
+          robot: to which the preset is fitted.
 
         Raises:
           ConfigError: as `BalanceGymEnv`.
@@ -219,12 +226,12 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         _check_mode(render_mode, self.metadata["render_modes"])
         if num_envs < 1:
             raise ConfigError(f"num_envs is {shown(num_envs)}; it must be at least 1")
-        self.boards = Boards(_config(preset, config), num_envs)
-        task, robot = self.boards.config.task, self.boards.scene.robot
+        self.boards = Boards(_config(preset, config, robot), num_envs)
+        task = self.boards.config.task
         self._actions = _Actions(task, action)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.single_action_space = self._actions.space
-        self.single_observation_space = _observations(task, robot)
+        self.single_observation_space = _observations(task, self.boards.scene.robot)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}

@@ -453,6 +453,10 @@ def test_what_there_is_not_is_refused(make: Any, config: Config) -> None:
         make(ENV, action="torque")
     with pytest.raises(ConfigError, match="preset is 'paper', and a config is given"):
         make(ENV, preset="paper", config=config)
+    with pytest.raises(ConfigError, match="robot is 'b2', and a config is given; leave one out"):
+        make(ENV, robot="b2", config=config)
+    with pytest.raises(ConfigError, match="robot is 'rex'; known robots: aliengo"):
+        make(ENV, robot="rex")
     with pytest.raises(ConfigError, match="fail_tilt is 95"):
         make(ENV, config=short(config, 3, fail_tilt=95.0))
 
@@ -470,6 +474,20 @@ def test_another_render_mode_is_refused() -> None:
 def test_presets_have_their_own_observations() -> None:
     assert BalanceGymEnv().observation_space.shape == (34,)
     assert BalanceGymEnv(preset="best").reset(seed=0)[0].shape == (136,)
+
+
+@pytest.mark.parametrize("kind", [BalanceGymEnv, BalanceVecEnv])
+def test_another_robot_brings_its_size(kind: Any) -> None:
+    """A B2's: 3 mm by its lever, 0.329 m over our 0.193; loads by its mass, 83.5 kg over 15.2."""
+    env = kind(preset="best", robot="b2", action="continuous")
+    config = env.boards.config
+    assert (config.robot, config.task.body_height) == ("b2", 0.571)
+    assert config.task.action_max == pytest.approx(0.003 * 0.329 / 0.193, rel=2e-3)
+    assert config.randomization.payload == pytest.approx(5 * 83.5 / 15.2, rel=2e-3)
+    obs = env.reset(seed=0)[0].reshape(-1, 136)[0]
+    for _ in range(3):
+        obs = env.step(np.zeros(env.action_space.shape))[0].reshape(-1, 136)[0]
+    assert np.abs(obs[:4]).max() < 0.5, "it stands at the height from which heights are counted"
 
 
 def test_pictures_are_of_now(env: Any) -> None:
