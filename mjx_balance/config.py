@@ -481,6 +481,10 @@ def check(config: Config, robot: Robot | None = None) -> Config:
       config: what is asked for.
       robot: what `config.robot` names, if that is known already.
     """
+    if not isinstance(config, Config):
+        raise ConfigError(
+            f"config is {shown(config)}; it must be a Config, as `preset` and `fitted` return"
+        )
     for section in (config, config.task, config.randomization, config.dqn):
         _check_fields(section)
     if config.preset not in PRESETS:

@@ -68,13 +68,42 @@ def _named(action: Any, array: np.ndarray | None, single: spaces.Space) -> str:
 
 def _config(preset: str | None, config: Config | None, robot: str | None) -> Config:
     """The one that is named, made for a robot; the preset "default" if none is."""
+    for name, value in (("preset", preset), ("robot", robot)):
+        if value is not None and not isinstance(value, str):
+            raise ConfigError(f"{name} is {shown(value)}; it must be a name")
     if config is None:
-        named = find_preset(preset or "default")
+        named = find_preset("default" if preset is None else preset)
         return named if robot is None else fitted(named, robot)
     for name, value in (("preset", preset), ("robot", robot)):
         if value is not None:
             raise ConfigError(f"{name} is {shown(value)}, and a config is given; leave one out")
     return config
+
+
+def _check_options(options: dict[str, Any] | None) -> None:
+    """Refuses what a reset would not do, as Gymnasium's `reset_mask`: every board starts anew."""
+    if options:
+        raise ValueError(f"options is {shown(options)}; it must be None or {{}}: there are none")
+
+
+def _seeds(seed: Any, count: int) -> list[int | None]:
+    """Of each board, or none.
+
+    Raises:
+      ValueError: if there are not as many as boards.
+    """
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + k for k in range(count)]
+    seeds = np.asarray(seed, object)
+    if seeds.ndim != 1:
+        raise ValueError(
+            f"seed is {shown(seed)}; it must be a whole number, or one or None for each env"
+        )
+    if len(seeds) != count:
+        raise ValueError(f"{len(seeds)} seeds are given for {count} envs")
+    return [int(x) if isinstance(x, np.integer) else x for x in seeds]
 
 
 def _observations(task: TaskConfig, robot: Robot) -> spaces.Box:
@@ -138,7 +167,16 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts a fresh scenario from the settled stance; there are no options."""
+        """Starts a fresh scenario from the settled stance.
+
+        Args:
+          seed: of the scenarios from here on; none: the generator goes on.
+          options: there are none.
+
+        Raises:
+          ValueError: if there are options.
+        """
+        _check_options(options)
         super().reset(seed=seed)
         obs = self.boards.start(np.arange(1), [self.np_random])
         self._under_way = True
@@ -224,8 +262,9 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
           UnsupportedMode: as `BalanceGymEnv`.
         """
         _check_mode(render_mode, self.metadata["render_modes"])
-        if num_envs < 1:
-            raise ConfigError(f"num_envs is {shown(num_envs)}; it must be at least 1")
+        whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
+        if not whole or num_envs < 1:
+            raise ConfigError(f"num_envs is {shown(num_envs)}; it must be a whole number above 0")
         self.boards = Boards(_config(preset, config, robot), num_envs)
         task = self.boards.config.task
         self._actions = _Actions(task, action)
@@ -240,7 +279,7 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: int | Sequence[int | None] | np.ndarray | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts fresh scenarios on all boards.
@@ -248,13 +287,13 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Args:
           seed: board k gets `seed + k`, or `seed[k]`; one that gets none goes on with its
             generator.
-          options: there are none.
+          options: there are none; `reset_mask` is for envs that do not start again by themselves.
+
+        Raises:
+          ValueError: if there are options, or not as many seeds as boards.
         """
-        seeds = [None] * self.num_envs if seed is None else seed
-        if isinstance(seeds, int | np.integer):
-            seeds = [int(seeds) + k for k in range(self.num_envs)]
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"{len(seeds)} seeds are given for {self.num_envs} envs")
+        _check_options(options)
+        seeds = _seeds(seed, self.num_envs)
         old = self._rngs or [None] * self.num_envs
         self._rngs = [
             np_random(number)[0] if rng is None or number is not None else rng

@@ -476,6 +476,62 @@ def test_presets_have_their_own_observations() -> None:
     assert BalanceGymEnv(preset="best").reset(seed=0)[0].shape == (136,)
 
 
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"config": "best"}, "config is 'best'; it must be a Config"),
+        ({"config": {"seed": 1}}, "config is {'seed': 1}; it must be a Config"),
+        ({"preset": {}}, "preset is {}; it must be a name"),
+        ({"preset": ""}, "unknown preset ''"),
+        ({"robot": 3}, "robot is 3; it must be a name"),
+    ],
+)
+def test_a_keyword_of_another_type_is_refused(make: Any, given: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        make(ENV, **given)
+    assert str(error.value).startswith(said)
+
+
+@pytest.mark.parametrize("count", [2.5, "3", None, True, -1, np.nan])
+def test_a_number_of_envs_is_whole(count: Any) -> None:
+    with pytest.raises(ConfigError) as error:
+        gymnasium.make_vec(ENV, num_envs=count)
+    assert str(error.value) == f"num_envs is {count!r}; it must be a whole number above 0"
+
+
+def test_seeds_may_come_as_an_array() -> None:
+    """Board k is then the env of that seed; what is no seed is Gymnasium's to refuse."""
+    envs: Any = BalanceVecEnv(4)
+    seen = []
+    for seed in ([7, 8, 9, 10], np.arange(7, 11), np.int64(7), list(np.arange(7, 11))):
+        envs.reset(seed=seed)
+        seen.append(envs.boards.scenario.targets.copy())
+    for targets in seen[1:]:
+        np.testing.assert_array_equal(targets, seen[0])
+    single = BalanceGymEnv()
+    single.reset(seed=9)
+    np.testing.assert_array_equal(seen[0][2], single.boards.scenario.targets[0])
+    for bad in (2.5, "3", [[1, 2, 3, 4]], {}):
+        with pytest.raises(ValueError, match="it must be a whole number, or one or None for each"):
+            envs.reset(seed=bad)
+    for bad in ([1, 2, 3, -4], [1, 2, 3, 0.5]):
+        with pytest.raises(gymnasium.error.Error, match="Seed must be"):
+            envs.reset(seed=bad)
+
+
+def test_options_are_refused_before_anything_starts_anew() -> None:
+    mask = {"reset_mask": np.asarray([True, False])}
+    env: Any
+    for env in (BalanceGymEnv(), BalanceVecEnv(2)):
+        env.reset(seed=0, options={})
+        env.step(np.full(env.action_space.shape, STAND)[()])
+        before = env.boards.qpos.copy()
+        with pytest.raises(ValueError, match=r"options is {'reset_mask': .*; it must be None or"):
+            env.reset(options=mask)
+        np.testing.assert_array_equal(env.boards.qpos, before)
+
+
 @pytest.mark.parametrize("kind", [BalanceGymEnv, BalanceVecEnv])
 def test_another_robot_brings_its_size(kind: Any) -> None:
     """A B2's: 3 mm by its lever, 0.329 m over our 0.193; loads by its mass, 83.5 kg over 15.2."""
