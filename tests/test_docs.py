@@ -17,6 +17,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 import tomllib
 import types
 from collections.abc import Callable, Iterator
@@ -29,7 +30,7 @@ import pytest
 import yaml
 from brax.training.agents.ppo import train as ppo
 
-from mjx_balance import brax_training, cli, config, env, evaluation, render
+from mjx_balance import brax_training, cli, config, env, evaluation, render, runtime
 from mjx_balance.engines.compiled import mujoco_engine
 from mjx_balance.report import page as report_page
 from mjx_balance.robots import find_robot, shipped
@@ -241,6 +242,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+class Clock:
+    """Time passes only where somebody sleeps: this machine is busy, a robot's is not."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes commands and snippets quick, behind flags and config."""
@@ -286,6 +300,10 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report_page, "write_report", lambda *arguments: [])
     # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
     monkeypatch.setattr(env, "make_engine", mujoco_engine)
+    clock = Clock()
+    monkeypatch.setattr(time, "monotonic", clock.monotonic)
+    monkeypatch.setattr(time, "sleep", clock.sleep)
+    monkeypatch.setattr(runtime.Controller.__init__, "__defaults__", (clock.monotonic,))
 
 
 def name_of(page: Path) -> str:
