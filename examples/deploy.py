@@ -1,15 +1,15 @@
 """A policy at work as on a robot: plain MuJoCo at 250 Hz and `mjx_balance/runtime.py`.
 
-python examples/deploy.py policies/best.safetensors
+python examples/deploy.py best
 """
 
-import sys
+import argparse
 
 import mujoco
 import numpy as np
 
-from mjx_balance import load_policy
 from mjx_balance.evaluation import policy_scene
+from mjx_balance.policy import PolicyError, find_policy, load_policy
 from mjx_balance.runtime import Controller, State
 from mjx_balance.suites import make_scenarios
 from mjx_balance.task.attitude import body_tilt
@@ -18,8 +18,14 @@ from mjx_balance.task.tilt import board_angle
 SECONDS = 20.0
 
 
-def main(path: str) -> None:
+def main() -> None:
     """Balances on a board that tilts on both axes at once, and prints the mean tilt."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
+    parser.add_argument("policy", help="file, run folder, or name of a shipped policy")
+    try:
+        path = find_policy(parser.parse_args().policy)
+    except PolicyError as error:
+        parser.error(str(error))
     scene = policy_scene(load_policy(path))  # board and robot; the policy itself runs below
     model, stance, task = scene.model, scene.stance, scene.config.task
     data = mujoco.MjData(model)
@@ -42,4 +48,4 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

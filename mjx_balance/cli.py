@@ -51,7 +51,7 @@ class EvaluateArgs:
     """Evaluate an exported policy in plain MuJoCo on all cores. Needs no JAX."""
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
-    """Policy file, or the name of a shipped one."""
+    """Policy file, run folder, or the name of a shipped policy."""
     controller: str | None = None
     """Baseline to evaluate instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     robot: str | None = None
@@ -88,7 +88,7 @@ class ExportArgs:
     """Write a policy as an ONNX model. Needs the package onnx, and no JAX."""
 
     policy: Annotated[Path, tyro.conf.Positional]
-    """Policy file."""
+    """Policy file, run folder, or the name of a shipped policy."""
     out: Path
     """File to write, NAME.onnx."""
 
@@ -98,7 +98,7 @@ class ViewArgs:
     """Watch a policy in MuJoCo's viewer; tilt the board and kick the robot by keys."""
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
-    """Policy file, or the name of a shipped one."""
+    """Policy file, run folder, or the name of a shipped policy."""
     controller: str | None = None
     """Baseline to watch instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     robot: str | None = None

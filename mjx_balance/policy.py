@@ -30,6 +30,7 @@ from mjx_balance.config import (
 from mjx_balance.dqn import heads
 from mjx_balance.errors import InputError
 from mjx_balance.robots import Robot, find_robot, robot_from_dict
+from mjx_balance.run_folder import RunFolder
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
 
@@ -283,24 +284,42 @@ def shipped_policies() -> dict[str, Path]:
     return {path.stem: path for path in sorted(found)}
 
 
+def find_policy(name: str | os.PathLike[str]) -> Path:
+    """The file of a policy.
+
+    Args:
+      name: the file's, a run folder's, or a shipped policy's.
+
+    Raises:
+      PolicyError: if there is none.
+    """
+    path, shipped = Path(name), shipped_policies()
+    try:
+        for file in (path, RunFolder(path).policy):
+            if file.is_file():
+                return file
+    except OSError as error:  # a name that is too long
+        raise PolicyError(
+            f"policy is {shown(str(path))}; it cannot be read: {error.strerror}"
+        ) from error
+    if str(path) not in shipped:
+        raise PolicyError(
+            f"no policy file at {path}; `mjx-balance train` writes one, and "
+            f"{', '.join(shipped)} are shipped"
+        )
+    return shipped[str(path)]
+
+
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Reads a policy file.
 
     Args:
-      path: of the file, or a shipped policy's name.
+      path: of the file, of the run folder that it is in, or a shipped policy's name.
 
     Raises:
       PolicyError: if it is missing, truncated, or not a policy this release can run.
     """
-    path = Path(path)
-    if not path.is_file():
-        shipped = shipped_policies()
-        if str(path) not in shipped:
-            raise PolicyError(
-                f"no policy file at {path}; `mjx-balance train` writes one, and "
-                f"{', '.join(shipped)} are shipped"
-            )
-        path = shipped[str(path)]
+    path = find_policy(path)
     if path.stat().st_size > MOST_BYTES:
         raise PolicyError(
             f"{path} has {path.stat().st_size} bytes; no policy has more than {MOST_BYTES}"

@@ -201,6 +201,7 @@ def test_resuming_a_finished_run_is_refused(
         (("sweep", "@text"), "sweep is 'this'; it must name one of learning_rate"),
         (("sweep", "gamma=0.1", "tau=1", "--preset", "smoke"), "sweep is 'tau=1'; it must name"),
         (("evaluate", "none.safetensors"), "no policy file at none.safetensors"),
+        (("evaluate", "."), "no policy file at .; "),
         (("evaluate", "text"), "text is damaged or no safetensors file"),
         (("evaluate",), "name a policy file or --controller NAME"),
         (("evaluate", "text", "--controller", "none"), "name a policy file or --controller NAME"),

@@ -17,7 +17,7 @@ FLOORS = (
     ("robots.draft",),
     ("robots",),
     ("config",),
-    ("task", "statistics"),
+    ("task", "statistics", "run_folder"),
     (
         *"task.actions task.attitude task.kinematics task.observation task.randomization".split(),
         *"task.pushes task.reward task.symmetry task.tilt dqn dqn.heads dqn.devices".split(),
@@ -26,7 +26,7 @@ FLOORS = (
         "task.decision",
         *"dqn.acting dqn.means dqn.networks dqn.replay dqn.whitening".split(),
     ),
-    ("scene", "suites", "policy", "run_folder", "dqn.collecting", "dqn.updating"),
+    ("scene", "suites", "policy", "dqn.collecting", "dqn.updating"),
     ("model_fields", "dqn.learner", "onnx_export"),
     ("engines", "engines.ffi", "engines.mujoco", "engines.engine", "controllers"),
     ("engines.mjx", "engines.compiled", "inspection", "boards"),

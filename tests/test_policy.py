@@ -22,7 +22,14 @@ from hypothesis import strategies as st
 import mjx_balance
 from mjx_balance.config import Config, preset
 from mjx_balance.dqn.networks import QNetwork
-from mjx_balance.policy import Policy, PolicyError, load_policy, make_manifest, save_policy
+from mjx_balance.policy import (
+    Policy,
+    PolicyError,
+    find_policy,
+    load_policy,
+    make_manifest,
+    save_policy,
+)
 
 HEADS = {"joint": (441,), "factored": (21, 21), "radial": (21, 21)}
 Weights = dict[str, np.ndarray]
@@ -159,6 +166,24 @@ def test_observation_of_another_size_is_refused(path: Path, shape: tuple[int, ..
 def test_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match=r"no policy file at .*nowhere"):
         load_policy(tmp_path / "nowhere")
+
+
+def test_a_run_folder_stands_for_its_policy(path: Path) -> None:
+    folder = path.parent / "runs" / "first"
+    folder.mkdir(parents=True)
+    with pytest.raises(PolicyError, match=f"no policy file at {folder}; "):
+        load_policy(folder)
+    path.rename(folder / "policy.safetensors")
+    assert find_policy(folder) == folder / "policy.safetensors"
+    assert load_policy(folder).manifest["training"] == {"seed": 5}
+
+
+def test_a_name_beyond_every_files_is_refused() -> None:
+    with pytest.raises(PolicyError) as error:
+        load_policy("a" * 300)
+    # Newer Pythons take such a name for one that is not there.
+    said = ("policy is 'aaaa", "no policy file at aaaa")
+    assert str(error.value).startswith(said)
 
 
 @pytest.mark.parametrize("kept", [0, 4, 100, -1])

@@ -776,13 +776,30 @@ def test_the_file_alone_runs_the_shipped_policy(tmp_path: Path, rig: Rig) -> Non
     np.testing.assert_array_equal(np.asarray(targets, float), expected.ravel())
 
 
+def example(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """What `examples/deploy.py` does."""
+    command = [sys.executable, str(REPO / "examples/deploy.py"), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=REPO)
+
+
 def test_the_example_balances() -> None:
-    command = [sys.executable, str(REPO / "examples/deploy.py"), str(BEST)]
-    run = subprocess.run(
-        command, capture_output=True, text=True, timeout=120, check=False, cwd=REPO
-    )
+    run = example("best")
     assert run.returncode == 0, run.stderr
     words = run.stdout.split()
     assert words[:2] == ["mean", "tilt"]
     assert 0.01 < float(words[2]) < 0.12
     assert float(words[5]) < 1.1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "error: the following arguments are required: policy"),
+        (("nobody",), "error: no policy file at nobody;"),
+    ],
+)
+def test_the_example_says_what_it_needs(arguments: tuple[str, ...], said: str) -> None:
+    run = example(*arguments)
+    assert (run.returncode, run.stdout) == (2, "")
+    assert run.stderr.startswith("usage: deploy.py [-h] policy\n")
+    assert said in run.stderr
