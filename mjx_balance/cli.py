@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from mjx_balance.controllers import Controller, ControllerError, make_controller
 from mjx_balance.errors import FAILED, INTERRUPTED, USAGE_ERROR, InputError
 from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
-from mjx_balance.run_folder import read_run_config
+from mjx_balance.run_folder import read_run_config, write_atomically, write_json
 from mjx_balance.scene import Scene, load_scene
 
 COMMANDS = ("train", "sweep", "evaluate", "report", "export", "view", "robot")
@@ -250,11 +249,8 @@ def _evaluate(argv: list[str]) -> int:
     from mjx_balance.report.tables import evaluation_table
 
     display = Display(Console(stderr=True))
-    for path in (args.json, args.video):
-        if path is not None and not path.absolute().parent.is_dir():
-            return _complain(f"cannot write {path}: its folder does not exist")
-    if args.video is not None and args.video.suffix != ".mp4":
-        return _complain(f"video is {args.video}; its name must end in .mp4")
+    _check_out("json", args.json)
+    _check_out("video", args.video, ".mp4")
     scene, controller = _who_acts(args.policy, args.controller, args.robot)
     with display.bar(f"evaluating, suite {args.suite}") as bar:
         rollout = evaluation.run_suite(
@@ -267,11 +263,11 @@ def _evaluate(argv: list[str]) -> int:
             bar,
         )
     result = evaluation.summarize(rollout, args.suite, args.duration, args.seed)
-    if args.json:
-        args.json.write_text(json.dumps(result, indent=2) + "\n")
     Console().print(evaluation_table({args.suite: result}))
     speed = result["physics_steps_per_second"]
-    print(f"{speed:,.0f} physics steps per second")
+    print(f"{speed:,.0f} physics steps per second", flush=True)
+    if args.json:
+        write_json(args.json, result)
     if args.video:
         return _video(scene, controller, args)
     return 0
@@ -301,6 +297,7 @@ def _report(argv: list[str]) -> int:
 
     if not args.run_dirs:
         return _complain("name at least one run folder")
+    _check_out("out", args.out)
     out = args.out or args.run_dirs[0] / "report.html"
     display = Display(Console(stderr=True))
     missing = write_report(args.run_dirs, out, args.scenarios, display.bar)
@@ -388,15 +385,32 @@ def _robot_new(argv: list[str]) -> int:
     if args.out is not None:
         if args.out.exists():
             return _complain(f"{args.out} exists already")
+        _check_out("out", args.out)
         if path == Path(model):
             model = os.path.relpath(path, args.out.parent)
     text = draft(model, path)
     if args.out is None:
         print(text, end="")
     else:
-        args.out.write_text(text)
+        write_atomically(args.out, text)
         print(f"{args.out}: see `mjx-balance robot check {args.out}`")
     return 0
+
+
+def _check_out(name: str, path: Path | None, suffix: str = "") -> None:
+    """Refuses a file that cannot be written, before what goes into it has taken its time.
+
+    Raises:
+      InputError: if its name ends in something else, or its folder does not exist.
+    """
+    if path is None:
+        return
+    if suffix and path.suffix != suffix:
+        raise InputError(f"{name} is {path}; its name must end in {suffix}")
+    if path.is_dir():
+        raise InputError(f"cannot write {path}: it is a folder")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"cannot write {path}: its folder does not exist")
 
 
 def _complain(message: str) -> int:

@@ -30,7 +30,7 @@ from mjx_balance.config import (
 from mjx_balance.dqn import heads
 from mjx_balance.errors import InputError
 from mjx_balance.robots import Robot, find_robot, robot_from_dict
-from mjx_balance.run_folder import RunFolder
+from mjx_balance.run_folder import RunFolder, write_atomically
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import observation_names, observation_scale
 
@@ -266,12 +266,15 @@ def save_policy(
 
     Returns:
       The policy as it will be loaded.
+
+    Raises:
+      PolicyError: if weights and manifest make no policy.
+      OSError: if it cannot be written.
     """
     weights = flat_weights(params)
     policy = Policy(manifest, weights)
-    part = Path(path).with_suffix(".part")
-    safetensors.numpy.save_file(weights, part, metadata={"manifest": json.dumps(manifest)})
-    part.replace(path)
+    content = safetensors.numpy.save(weights, metadata={"manifest": json.dumps(manifest)})
+    write_atomically(Path(path), content)
     return policy
 
 

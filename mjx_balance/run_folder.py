@@ -118,19 +118,27 @@ class RunFolder:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes a file whole or not at all, whenever the process or the machine dies.
 
+    Links are followed. A pipe or a device is written to, not replaced.
+
     Raises:
       OSError: if it cannot be written; what was there before is then still there, and no more.
     """
-    part = path.with_name(f"{path.name}.part")
+    data, part = content.encode() if isinstance(content, str) else content, None
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            path.write_bytes(data)
+            return
+        target = path.resolve()
+        part = target.with_name(f"{target.name}.part")
         with part.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        part.replace(path)
+        part.replace(target)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
+        if part is not None:
+            with contextlib.suppress(OSError):
+                part.unlink()
         error.filename = str(path)  # what the user knows of
         raise
 

@@ -214,6 +214,8 @@ def test_resuming_a_finished_run_is_refused(
         (("report", "."), ". is no run folder: it has none of config.json"),
         (("report", "nowhere"), "nowhere is no folder"),
         (("evaluate", "text", "--json", "no/such/out.json"), "cannot write no/such/out.json"),
+        (("evaluate", "--controller", "none", "--json", "."), "cannot write .: it is a folder"),
+        (("report", ".", "--out", "no/such.html"), "cannot write no/such.html: its folder does"),
         (("evaluate", "--controller", "none", "--video", "text"), "video is text; its name must"),
         (("evaluate", "--controller", "none", "--seed", "-1"), "seed is -1"),
         (("evaluate", "--controller", "none", "--scenarios", "0"), "scenarios is 0"),
@@ -261,6 +263,33 @@ def test_evaluate_writes_figures_and_a_video(
     fps, frames = videos.read(tmp_path / "v.mp4")
     assert (fps, len(frames), frames.shape[1:3]) == (25, 10, VIDEO_SIZE[::-1])
     assert np.abs(frames[-1] - frames[0]).mean() > 0.1, "the board moves"
+
+
+def full(number: int) -> None:
+    """Stands for `os.fsync` on a disk without room."""
+    raise OSError(28, "No space left on device")
+
+
+def test_a_full_disk_does_not_lose_the_table(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "out.json").write_text("older")
+    monkeypatch.setattr(os, "fsync", full)
+    flags = "--controller none --scenarios 1 --duration 0.2 --json out.json"
+    assert main(("evaluate", *flags.split())) == 2
+    said = capsys.readouterr()
+    assert "1 x 0.2 s" in said.out
+    assert said.err.endswith("mjx-balance: cannot write out.json: No space left on device\n")
+    assert [(x.name, x.read_text()) for x in tmp_path.iterdir()] == [("out.json", "older")]
+
+
+def test_a_full_disk_leaves_no_half_robot(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(os, "fsync", full)
+    assert main(("robot", "new", "scenes:quadruped.xml", "--out", "rex.toml")) == 2
+    assert "cannot write rex.toml: No space left on device" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_robots_draft_can_be_checked_and_trained(

@@ -366,6 +366,31 @@ def test_a_flipped_byte_is_refused_or_loads(
         assert load_policy(scratch).q_values(np.zeros(34)).shape == (441,)
 
 
+def test_a_policy_is_written_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As safetensors itself writes it; a neighbour that is called policy.part stays."""
+    path, neighbour = tmp_path / "policy.safetensors", tmp_path / "policy.part"
+    neighbour.write_text("not ours")
+    written(path)
+    whole = path.read_bytes()
+    with safetensors.safe_open(path, framework="numpy") as file:
+        metadata = file.metadata()
+    again = tmp_path / "again"
+    safetensors.numpy.save_file(safetensors.numpy.load_file(path), again, metadata=metadata)
+    assert again.read_bytes() == whole
+
+    def full(number: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left") as error:
+        written(path, "joint")
+    assert error.value.filename == str(path)
+    assert path.read_bytes() == whole
+    assert {x.name for x in tmp_path.iterdir()} == {path.name, neighbour.name, "again"}
+
+
 def test_unfit_weights_are_never_written(tmp_path: Path) -> None:
     params = jax.tree.map(lambda x: np.full(x.shape, np.nan), random_params("joint"))
     manifest = make_manifest(small_config("joint"), "0" * 16, {})

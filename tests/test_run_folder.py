@@ -74,6 +74,28 @@ def test_a_failed_write_leaves_the_old_file(
     assert os.listdir(tmp_path) == ["file.json"]
 
 
+def test_links_are_followed_and_pipes_written_to(tmp_path: Path) -> None:
+    """Neither is replaced: what they stand for is somewhere else."""
+    (tmp_path / "there").mkdir()
+    file, link, pipe = (tmp_path / name for name in ("there/file", "link", "pipe"))
+    link.symlink_to(file)
+    for content in ("first", "second"):
+        write_atomically(link, content)
+        assert link.is_symlink()
+        assert file.read_text() == content
+    assert os.listdir(tmp_path / "there") == ["file"]
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_atomically(pipe, "through")
+    assert os.read(reader, 100) == b"through"
+    os.close(reader)
+    assert pipe.is_fifo()
+    with pytest.raises(OSError, match="directory") as error:
+        write_atomically(tmp_path / "there", "x")
+    assert error.value.filename == str(tmp_path / "there")
+    assert sorted(os.listdir(tmp_path)) == ["link", "pipe", "there"]
+
+
 def test_a_new_folder_has_config_and_provenance_and_nothing_beside_it(folder: RunFolder) -> None:
     assert json.loads(folder.config.read_text()) == to_dict(CONFIG)
     assert json.loads(folder.provenance.read_text()) == TODAY

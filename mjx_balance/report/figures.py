@@ -11,6 +11,7 @@ import numpy as np
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.evaluation import Envelope, Rollout
+from mjx_balance.run_folder import write_atomically
 from mjx_balance.scene import Scene
 from mjx_balance.suites import HEADLINE
 from mjx_balance.task.attitude import roll_pitch
@@ -75,7 +76,7 @@ def draw_figures(
         "rollout.png": rollout_figure(scene, rollouts),
     }
     for name, figure in drawn.items():
-        (folder / name).write_bytes(png(figure))
+        write_atomically(folder / name, png(figure))
     return [folder / name for name in drawn]
 
 

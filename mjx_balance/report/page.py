@@ -19,7 +19,7 @@ from mjx_balance.report import figures, measuring
 from mjx_balance.report.measuring import Measured
 from mjx_balance.report.reading import Run, read_run
 from mjx_balance.report.tables import spread
-from mjx_balance.run_folder import RunFolder
+from mjx_balance.run_folder import RunFolder, write_atomically
 from mjx_balance.scene import Scene
 from mjx_balance.statistics import TILTS, over_seeds
 from mjx_balance.suites import HEADLINE, SEEDS
@@ -92,7 +92,7 @@ def write_report(
         "versions": policy and versions(policy),
     }
     # Surrogates, as file names may hold them, have no UTF-8.
-    out.write_bytes(render_page(page).encode("utf-8", "replace"))
+    write_atomically(out, render_page(page).encode("utf-8", "replace"))
     return missing
 
 
