@@ -110,6 +110,12 @@ def find_suite(name: str) -> Suite:
     return SUITES[name]
 
 
+def check_seed(seed: int) -> None:
+    """Raises `SuiteError` for a seed that nothing can be drawn by."""
+    if seed < 0:
+        raise SuiteError(f"seed is {seed}; it must not be negative")
+
+
 def make_scenarios(
     config: Config, suite: str, scenarios: int, duration: float, seed: int
 ) -> tuple[tilt.Scenario, Conditions]:
@@ -122,8 +128,7 @@ def make_scenarios(
         before its next target.
     """
     chosen, task, robot = find_suite(suite), config.task, find_robot(config.robot)
-    if seed < 0:
-        raise SuiteError(f"seed is {seed}; it must not be negative")
+    check_seed(seed)
     count = tilt.num_targets(task, duration)
     rngs = [np.random.default_rng((seed, k)) for k in range(scenarios)]
     uniform = np.asarray([rng.uniform(size=(count, 2)) for rng in rngs])

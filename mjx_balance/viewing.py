@@ -8,6 +8,7 @@ from mjx_balance.config import greatest_incline
 from mjx_balance.controllers import Controller
 from mjx_balance.evaluation import Trials, suite_trials
 from mjx_balance.scene import Scene
+from mjx_balance.suites import check_seed
 from mjx_balance.task import tilt
 from mjx_balance.task.pushes import Pushes
 
@@ -32,16 +33,18 @@ class Session:
           scene: model, stance and task.
           controller: acts.
           suite: whose targets, kicks and circumstances these are; none: the keys'.
-          seed: of that scenario, and of the directions of kicks.
+          seed: of its first scenario, the next ones taking those that follow, and of the directions
+            of kicks.
 
         Raises:
-          SuiteError: if there is no such suite.
+          SuiteError: if there is no such suite, or the seed is negative.
         """
+        check_seed(seed)
         self.scene, self.task, self.controller = scene, scene.config.task, controller
         self.suite, self.seed = suite, seed
         self.most = greatest_incline(self.task, scene.robot)
         self.rng = np.random.default_rng(seed)
-        self.falls = 0
+        self.falls, self.rounds = 0, 0
         self._start()
 
     def _start(self) -> None:
@@ -49,7 +52,8 @@ class Session:
             self.trials = Trials(self.scene, self._keyed(np.zeros((2, 2)), 0), threads=1)
         else:
             long = self.task.episode_length * self.task.ctrl_dt
-            self.trials = suite_trials(self.scene, self.suite, 1, long, self.seed, threads=1)
+            seed = self.seed + self.rounds
+            self.trials = suite_trials(self.scene, self.suite, 1, long, seed, threads=1)
         self.pushes = self.trials.pushes or Pushes(np.zeros((1, 0, 2)), np.zeros(0, int))
         self.target, self.board = np.zeros(2), np.zeros(2)
         self.kicked, self.number, self.tilt = np.zeros(2), 0, 0.0
@@ -85,6 +89,7 @@ class Session:
         over = self.suite is not None and self.number >= self.task.episode_length
         if made.down[0] or over:
             self.falls += bool(made.down[0])
+            self.rounds += 1
             self._start()
         return made.motion.qpos[0]
 

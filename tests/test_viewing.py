@@ -6,7 +6,7 @@ import pytest
 from mjx_balance.controllers import Controller, View, make_controller
 from mjx_balance.evaluation import run_suite
 from mjx_balance.scene import Scene
-from mjx_balance.suites import SuiteError
+from mjx_balance.suites import SuiteError, make_scenarios
 from mjx_balance.task.tilt import board_angle
 from mjx_balance.viewing import DOWN, KICK_KEY, LEFT, LEVEL, RIGHT, UP, Session
 
@@ -95,6 +95,21 @@ def test_a_suite_is_shown_as_it_is_evaluated(scene: Scene, suite: str) -> None:
     one.press(RIGHT)  # is not listened to
     states = np.concatenate([one.decide() for _ in range(60)])
     np.testing.assert_allclose(states, rollout.qpos[0, : len(states)], atol=1e-9)
+
+
+def test_the_next_round_of_a_suite_is_another_one(scene: Scene) -> None:
+    """That of the next seed; who stands still falls in every corner."""
+    one = session(scene, "none", "corner")
+    while one.falls < 2:
+        one.decide()
+    third, _ = make_scenarios(scene.config, "corner", 1, 60.0, seed=5)
+    np.testing.assert_array_equal(one.trials.scenarios.targets, third.targets)
+
+
+def test_a_negative_seed_is_refused(scene: Scene) -> None:
+    for suite in (None, "push"):
+        with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
+            Session(scene, make_controller("none", scene), suite, seed=-1)
 
 
 def test_a_kick_by_hand_comes_beside_those_of_a_suite(scene: Scene) -> None:
