@@ -20,6 +20,7 @@ from mjx_balance.quiet import quiet_imports
 from mjx_balance.run_folder import read_run_config, write_atomically, write_json
 from mjx_balance.scene import Scene, load_scene
 
+HELP = ("-h", "--help")
 COMMANDS = ("train", "sweep", "evaluate", "report", "export", "view", "robot")
 
 
@@ -115,7 +116,7 @@ class RobotCheckArgs:
     robot: Annotated[str, tyro.conf.Positional]
     """TOML file, shipped robot's name, or menagerie:NAME."""
     picture: Path | None = None
-    """PNG to draw it to; none: NAME.png in this folder."""
+    """PNG to draw it to; none: NAME-check.png in this folder, whatever is there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns its exit code, 2 for input that cannot be used."""
     argv = list(sys.argv[1:] if arguments is None else arguments)
     if not argv or argv[0] not in COMMANDS:
-        wants_help = bool(argv) and argv[0] in ("-h", "--help")
+        wants_help = bool(argv) and argv[0] in HELP
         print(f"usage: mjx-balance {{{','.join(COMMANDS)}}} ... (--help after one lists its flags)")
         if argv and not wants_help:
             _complain(f"unknown command {argv[0]!r}; known commands: {', '.join(COMMANDS)}")
@@ -168,7 +169,7 @@ def _sweep(argv: list[str]) -> int:
             entries += Path(text[1:]).read_text().split()
         except (OSError, UnicodeDecodeError) as error:
             return _complain(f"the values in {text[1:]} cannot be read: {error}")
-    if not entries and "--resume" not in argv and "--help" not in argv:
+    if not entries and not {"--resume", *HELP} & set(argv):
         return _complain(
             "say what to try, as gamma=0.1,0.4, or @FILE with such entries, before train's flags"
         )
@@ -336,7 +337,7 @@ def _view(argv: list[str]) -> int:
     try:
         window = render.Window(scene.config, session.press)
     except render.RenderError as error:
-        return _complain(str(error))
+        return _complain(f"{error}; `mjx-balance evaluate --video` needs no display")
     corners = mujoco.mjtGridPos
     keys = "Enter: kick" if args.suite else viewing.HELP
     try:
@@ -354,6 +355,9 @@ def _view(argv: list[str]) -> int:
 def _robot(argv: list[str]) -> int:
     """`mjx-balance robot check ROBOT` and `mjx-balance robot new MODEL`."""
     commands = {"check": _robot_check, "new": _robot_new}
+    if argv and argv[0] in HELP:
+        print("usage: mjx-balance robot {check,new} ... (--help after one lists its flags)")
+        return 0
     if not argv or argv[0] not in commands:
         return _complain("say robot check FILE.toml, or robot new MODEL.xml")
     return commands[argv[0]](argv[1:])
@@ -363,9 +367,10 @@ def _robot_check(argv: list[str]) -> int:
     args = tyro.cli(RobotCheckArgs, args=argv, prog="mjx-balance robot check")
     from mjx_balance import inspection, render
 
+    _check_out("picture", args.picture, ".png")
     scene, tilted = inspection.find_out(args.robot)
     print("\n".join(inspection.described(scene, tilted)))
-    picture = args.picture or Path(f"{scene.robot.name.replace(':', '_')}.png")
+    picture = args.picture or Path(f"{scene.robot.name.replace(':', '_')}-check.png")
     try:
         render.write(picture, scene.config, tilted.qpos[None])
     except render.RenderError as error:

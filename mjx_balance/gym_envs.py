@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from mjx_balance.boards import Boards, Step
 from mjx_balance.config import Config, ConfigError, TaskConfig, fitted, shown
 from mjx_balance.config import preset as find_preset
-from mjx_balance.render import Painter, Window
+from mjx_balance.render import Painter, RenderError, Window
 from mjx_balance.robots import Robot
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.decision import ABSURD
@@ -218,9 +218,14 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
 
     def _show(self, qpos: np.ndarray) -> None:
         """Plays states (1, steps, nq) in the window, if there is to be one."""
-        if self.render_mode == "human":
-            self._window = self._window or Window(self.boards.config)
-            self._window.play(qpos[0])
+        if self.render_mode != "human":
+            return
+        if self._window is None:
+            try:
+                self._window = Window(self.boards.config)
+            except RenderError as error:
+                raise RenderError(f"{error}; render_mode 'rgb_array' needs no display") from error
+        self._window.play(qpos[0])
 
 
 class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):

@@ -24,6 +24,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.config import Config, from_dict, to_dict
+from mjx_balance.run_folder import write_atomically
 from mjx_balance.scene import build_model
 
 FPS = 25
@@ -31,6 +32,8 @@ VIDEO_SIZE = (960, 544)
 PICTURE_SIZE = (1280, 720)
 BACKENDS = ("egl", "osmesa")
 CHILD = (sys.executable, "-m", "mjx_balance.render")
+UNWRITTEN = 3
+"""What that process ends with if it could draw, but not write."""
 
 
 class RenderError(RuntimeError):
@@ -39,6 +42,8 @@ class RenderError(RuntimeError):
 
 def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") -> None:
     """Draws states to a file: `.png` the first of them, anything else all as a video.
+
+    The file is written whole or not at all.
 
     Args:
       path: file to write; a video plays at real speed.
@@ -51,17 +56,22 @@ def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") ->
     """
     stride = frame_stride(config)
     with tempfile.TemporaryDirectory() as folder:
-        job = Path(folder) / "job.npz"
-        header = {"config": to_dict(config), "camera": camera, "path": str(path.absolute())}
+        job, drawn = Path(folder) / "job.npz", Path(folder) / f"drawn{path.suffix}"
+        header = {"config": to_dict(config), "camera": camera, "path": str(drawn)}
         header["fps"] = 1 / (stride * config.task.sim_dt)
         np.savez(job, qpos=qpos[::stride], header=json.dumps(header))
         reason = ""
         for environment in _environments():
             command = [*CHILD, str(job)]
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
-            if done.returncode == 0:
-                return
             reason = done.stderr
+            if done.returncode == UNWRITTEN:
+                raise RenderError(f"{path} cannot be written: {_last_line(reason)}")
+            if done.returncode == 0:
+                try:
+                    return write_atomically(path, drawn.read_bytes())
+                except OSError as error:
+                    raise RenderError(f"{path} cannot be written: {error.strerror}") from error
     raise _failed(reason)
 
 
@@ -137,7 +147,7 @@ class Window:
           on_key: told of every key that is pressed, by GLFW's code.
 
         Raises:
-          RenderError: if there is no display to open it on.
+          RenderError: if there is no display to open it on, or macOS wants another Python.
         """
         _check_display()
         import mujoco.viewer
@@ -146,13 +156,19 @@ class Window:
         self._pause = self._stride * config.task.sim_dt
         self._model = build_model(config, visual=True)
         self._data = mujoco.MjData(self._model)
-        self._viewer = mujoco.viewer.launch_passive(
-            self._model,
-            self._data,
-            key_callback=on_key,
-            show_left_ui=False,
-            show_right_ui=False,
-        )
+        try:
+            self._viewer = mujoco.viewer.launch_passive(
+                self._model,
+                self._data,
+                key_callback=on_key,
+                show_left_ui=False,
+                show_right_ui=False,
+            )
+        except RuntimeError as error:  # on macOS windows belong to the main thread
+            raise RenderError(
+                f"no window can be opened here ({error}); start it by mjpython, as `mjpython -m "
+                "mjx_balance view best`"
+            ) from error
         self._viewer.cam.fixedcamid = self._model.camera("main").id
         self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._next = time.monotonic()
@@ -205,10 +221,7 @@ def _check_display() -> None:
             glfw.default_window_hints()
     if not window:
         reason = str(said[-1].message) if said else "unknown reason"
-        raise RenderError(
-            f"no window can be opened here ({reason}); render_mode 'rgb_array' and "
-            "`mjx-balance evaluate --video` need no display"
-        )
+        raise RenderError(f"no window can be opened here ({reason})")
     glfw.destroy_window(window)
 
 
@@ -226,11 +239,14 @@ def _environments() -> Iterator[dict[str, str]]:
 
 def _failed(said: str) -> RenderError:
     """What the last backend's process said, in a sentence."""
-    reason = (said.strip().splitlines() or ["unknown reason"])[-1]
     return RenderError(
-        f"offscreen rendering with {' or '.join(_backends())} failed ({reason}); on Debian, "
-        "install libegl1 or libosmesa6"
+        f"offscreen rendering with {' or '.join(_backends())} failed ({_last_line(said)}); on "
+        "Debian, install libegl1 or libosmesa6"
     )
+
+
+def _last_line(said: str) -> str:
+    return (said.strip().splitlines() or ["unknown reason"])[-1]
 
 
 @contextlib.contextmanager
@@ -277,12 +293,16 @@ def _draw(job: Path) -> None:
     path = Path(header["path"])
     picture = path.suffix == ".png"
     with _drawing(header, PICTURE_SIZE if picture else VIDEO_SIZE) as draw:
-        if picture:
-            imageio.imwrite(path, draw(qpos[0]))
-            return
-        with imageio.get_writer(path, fps=header["fps"], quality=8) as writer:
-            for state in qpos:
-                writer.append_data(draw(state))
+        try:
+            if picture:
+                imageio.imwrite(path, draw(qpos[0]))
+                return
+            with imageio.get_writer(path, fps=header["fps"], quality=8) as writer:
+                for state in qpos:
+                    writer.append_data(draw(state))
+        except OSError as error:  # of the disk: OpenGL's are others
+            print(error.strerror or error, file=sys.stderr)
+            sys.exit(UNWRITTEN)
 
 
 if __name__ == "__main__":

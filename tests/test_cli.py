@@ -265,6 +265,20 @@ def test_evaluate_writes_figures_and_a_video(
     assert np.abs(frames[-1] - frames[0]).mean() > 0.1, "the board moves"
 
 
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+@pytest.mark.parametrize("command", [(), ("robot",), ("robot", "check"), ("sweep",), ("view",)])
+def test_help_is_no_error(
+    command: tuple[str, ...], flag: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = main((*command, flag))
+    except SystemExit as stopped:  # tyro's own
+        code = stopped.code
+    said = capsys.readouterr()
+    assert (code, said.err) == (0, "")
+    assert said.out.startswith("usage: mjx-balance ")
+
+
 def full(number: int) -> None:
     """Stands for `os.fsync` on a disk without room."""
     raise OSError(28, "No space left on device")
@@ -306,6 +320,8 @@ def test_a_robots_draft_can_be_checked_and_trained(
     assert "rex: 15.20 kg" in said
     assert said.endswith("picture: rex.png\n")
     assert Path("rex.png").stat().st_size > 50_000
+    assert main(["robot", "check", "rex.toml"]) == 0
+    assert capsys.readouterr().out.endswith("picture: rex-check.png\n")
     assert main(["robot", "new", "model.xml"]) == 0
     assert capsys.readouterr().out == Path("rex.toml").read_text()
 
@@ -316,6 +332,14 @@ def test_a_robots_draft_can_be_checked_and_trained(
         (("robot",), "say robot check FILE.toml, or robot new MODEL.xml"),
         (("robot", "buy"), "say robot check FILE.toml"),
         (("robot", "check", "none.toml"), "no robot file at none.toml"),
+        (
+            ("robot", "check", "none.toml", "--picture", "no/such.png"),
+            "cannot write no/such.png: its folder does not exist",
+        ),
+        (
+            ("robot", "check", "none.toml", "--picture", "rex.jpg"),
+            "picture is rex.jpg; its name must end in .png",
+        ),
         (("robot", "new", "none.xml"), "there is no file none.xml"),
         (("robot", "new", "menagerie:rex"), "menagerie:rex cannot be had"),
         (("robot", "new", "rex.toml"), "rex.toml cannot be read"),
@@ -391,7 +415,8 @@ def test_view_shows_a_policy_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
         (("nobody",), "no policy file at nobody; `mjx-balance train` writes one, and best"),
         (("best", "--suite", "sea"), "unknown suite 'sea'"),
         (("--controller", "pd-imu", "--robot", "rex"), "robot is 'rex'"),
-        (("best",), "no window can be opened here"),
+        (("best", "--seed", "-1"), "seed is -1; it must not be negative"),
+        (("best",), "); `mjx-balance evaluate --video` needs no display\n"),
     ],
 )
 def test_what_cannot_be_viewed_is_said(

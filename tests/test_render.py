@@ -5,12 +5,13 @@ import itertools
 from pathlib import Path
 
 import imageio.v2 as imageio
+import mujoco.viewer
 import numpy as np
 import pytest
 import videos
 
 from mjx_balance.config import Config
-from mjx_balance.render import PICTURE_SIZE, VIDEO_SIZE, RenderError, write
+from mjx_balance.render import PICTURE_SIZE, VIDEO_SIZE, RenderError, Window, write
 from mjx_balance.scene import Scene
 
 
@@ -63,3 +64,35 @@ def test_no_backend_gives_one_sentence(
     with pytest.raises(RenderError, match="offscreen rendering with steam failed"):
         write(tmp_path / "never.png", config, scene.stance.qpos[None])
     assert not (tmp_path / "never.png").exists()
+
+
+def test_a_file_that_cannot_be_written_is_no_matter_of_opengl(
+    config: Config, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was there before stays, and nothing beside it."""
+    (tmp_path / "old.png").write_text("old")
+    draw(tmp_path / "new.png", config, scene.stance.qpos[None])
+
+    def full(number: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    for name in ("old.png", "none.png", "no/such.png"):
+        with pytest.raises(RenderError) as error:
+            write(tmp_path / name, config, scene.stance.qpos[None])
+        reason = "No such file or directory" if "/" in name else "No space left on device"
+        assert str(error.value) == f"{tmp_path / name} cannot be written: {reason}"
+    assert {x.name for x in tmp_path.iterdir()} == {"old.png", "new.png"}
+    assert (tmp_path / "old.png").read_text() == "old"
+
+
+def test_macos_wants_mjpython(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = "`launch_passive` requires that the Python script be run under `mjpython` on macOS"
+
+    def launch(*arguments: object, **looks: object) -> None:
+        raise RuntimeError(said)
+
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
+    monkeypatch.setattr("mjx_balance.render._check_display", lambda: None)
+    with pytest.raises(RenderError, match=r"no window can be .*; start it by mjpython, as `mjpy"):
+        Window(config)

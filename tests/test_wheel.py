@@ -68,7 +68,7 @@ def test_it_evaluates_exports_and_checks_robots_anywhere(installed: Path, tmp_pa
     assert run(installed, tmp_path, "evaluate", "best", *flags).startswith("0 ")
     assert run(installed, tmp_path, "export", "best", "--out", "p.onnx").startswith("0 ")
     assert "15.20 kg" in run(installed, tmp_path, "robot", "check", "quadruped")
-    assert {p.name for p in tmp_path.iterdir()} == {"out.json", "p.onnx", "quadruped.png"}
+    assert {p.name for p in tmp_path.iterdir()} == {"out.json", "p.onnx", "quadruped-check.png"}
 
 
 def test_training_without_what_it_needs_says_so(installed: Path, tmp_path: Path) -> None:
