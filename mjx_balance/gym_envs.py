@@ -71,13 +71,12 @@ def _config(preset: str | None, config: Config | None, robot: str | None) -> Con
     for name, value in (("preset", preset), ("robot", robot)):
         if value is not None and not isinstance(value, str):
             raise ConfigError(f"{name} is {shown(value)}; it must be a name")
-    if config is None:
-        named = find_preset("default" if preset is None else preset)
-        return named if robot is None else fitted(named, robot)
-    for name, value in (("preset", preset), ("robot", robot)):
-        if value is not None:
+        if value is not None and config is not None:
             raise ConfigError(f"{name} is {shown(value)}, and a config is given; leave one out")
-    return config
+    if config is not None:
+        return config
+    named = find_preset("default" if preset is None else preset)
+    return named if robot is None else fitted(named, robot)
 
 
 def _check_options(options: dict[str, Any] | None) -> None:
