@@ -14,7 +14,7 @@ from rich.console import Console
 from mjx_balance import evaluation
 from mjx_balance.config import Config, check, fitted, preset
 from mjx_balance.controllers import Controller, ControllerError, make_controller
-from mjx_balance.errors import FAILED, INTERRUPTED, USAGE_ERROR, InputError
+from mjx_balance.errors import FAILED, INTERRUPTED, USAGE_ERROR, InputError, how_to_install
 from mjx_balance.policy import PolicyError, load_policy
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.run_folder import read_run_config, write_atomically, write_json
@@ -199,7 +199,7 @@ def _train(argv: list[str]) -> int:
     except ModuleNotFoundError as error:
         return _complain(
             f"training needs {(error.name or '').partition('.')[0]}, which is not installed; "
-            "`pip install 'mjx-balance[train]'` brings what it needs"
+            + how_to_install("train")
         )
     from mjx_balance.display import Display
 
@@ -315,7 +315,7 @@ def _export(argv: list[str]) -> int:
     try:
         from mjx_balance.onnx_export import OPSET, export_onnx
     except ImportError as error:
-        return _complain(f"export needs the package onnx, as of pip install onnx: {error}")
+        return _complain(f"export needs the package onnx ({error}); {how_to_install('onnx')}")
     policy = load_policy(args.policy)
     size = export_onnx(policy, args.out)
     print(f"{args.out}: {size / 1000:,.1f} kB, opset {OPSET}")

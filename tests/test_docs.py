@@ -159,7 +159,8 @@ def run_make(rest: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 def check_install(rest: list[str]) -> str:
     """Extras of ours that `pip install` names exist."""
     assert rest[0] == "install"
-    for ours in (x for x in rest if x.startswith(("mjx-balance[", ".["))):
+    assert not [x for x in rest if x.startswith("mjx-balance")], "our package is on no index"
+    for ours in (x for x in rest if x.startswith(".[")):
         extras = ours.partition("[")[2].rstrip("]").split(",")
         assert set(extras) <= set(PROJECT["optional-dependencies"]), ours
     return ""
@@ -336,6 +337,16 @@ def test_snippets_run(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
             raise AssertionError(f"{where}: {error!r}") from error
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/start.md"])
+def test_a_page_says_where_its_commands_are_before_it_uses_one(page: str) -> None:
+    """After `make train` they are in `.venv`, and on no path."""
+    text = (REPO / page).read_text()
+    before, activated, _ = text.partition(ELSEWHERE[0])
+    assert activated
+    assert "mjx-balance " not in before
+    assert "pip install" not in before
+
+
 def test_every_command_is_shown() -> None:
     shown = "".join(page.read_text() for page in PAGES)
     missing = [x for x in cli.COMMANDS if f"mjx-balance {x} " not in shown]
@@ -415,7 +426,8 @@ BROKEN: list[tuple[str, str]] = [
     ("sh", "mjx-balance robot check menagerie:rex"),
     ("sh", "python examples/train_sb3.py --algorithm sac"),
     ("sh", "python examples/missing.py"),
-    ("sh", 'pip install "mjx-balance[everything]"'),
+    ("sh", 'pip install -e ".[everything]"'),
+    ("sh", 'pip install "mjx-balance[robots]"'),
     ("sh", "srun mjx-balance train --distribute"),
     ("sh", "curl somewhere"),
     ("yaml", "args: [mjx-balance train --process-idx 0]"),

@@ -199,7 +199,8 @@ def test_without_the_package_onnx_it_says_so(
     monkeypatch.delitem(sys.modules, "mjx_balance.onnx_export")
     assert main(["export", str(SHIPPED), "--out", str(tmp_path / "p.onnx")]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("mjx-balance: export needs the package onnx, as of pip install onnx")
+    assert said.startswith("mjx-balance: export needs the package onnx (")
+    assert "; the extra onnx brings it: `pip install -e '.[onnx]'` in a checkout, or" in said
     assert said.count("\n") == 1
     assert not os.listdir(tmp_path)
 

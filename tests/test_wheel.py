@@ -74,5 +74,6 @@ def test_it_evaluates_exports_and_checks_robots_anywhere(installed: Path, tmp_pa
 def test_training_without_what_it_needs_says_so(installed: Path, tmp_path: Path) -> None:
     said = run(installed, tmp_path, "train", "--preset", "smoke")
     assert said.startswith("2 ")
-    assert "training needs jax, which is not installed; `pip install 'mjx-balance[train]'`" in said
+    assert "training needs jax, which is not installed; the extra train brings it" in said
+    assert "`pip install 'WHEEL[train]'`" in said
     assert list(tmp_path.iterdir()) == []

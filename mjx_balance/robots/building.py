@@ -58,8 +58,8 @@ def _menagerie(name: str) -> Path:
         import mujoco_menagerie
     except ImportError:
         raise RobotError(
-            f"robot menagerie:{name} needs the package mujoco-menagerie; "
-            "`pip install mjx-balance[robots]` brings it"
+            f"robot menagerie:{name} needs the package mujoco-menagerie; the extra robots brings "
+            "it: `pip install -e '.[robots]'` in a checkout, or `pip install 'WHEEL[robots]'`"
         ) from None
     try:
         robot = mujoco_menagerie.get(name)

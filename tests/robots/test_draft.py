@@ -131,5 +131,5 @@ def test_menagerie_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robo
 
 def test_menagerie_is_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
-    with pytest.raises(RobotError, match=r"needs the package mujoco-menagerie; `pip install"):
+    with pytest.raises(RobotError, match=r"mujoco-menagerie; the extra robots brings it: `pip"):
         find_robot("menagerie:unitree_b1")
