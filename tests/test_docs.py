@@ -353,6 +353,26 @@ def test_every_command_is_shown() -> None:
     assert not missing, f"README.md and docs/ show no `mjx-balance {missing[0]}`"
 
 
+def test_how_often_a_transition_is_drawn() -> None:
+    """By every preset that the page does not name apart, and by those that it does."""
+    said = re.search(
+        r"is drawn some (\d+) times \(`(\w+)`: (\d+), `(\w+)`: (\d+)\)",
+        (DOCS / "how_it_works.md").read_text(),
+    )
+    assert said
+    usual, *others = said.groups()
+    told = dict.fromkeys(config.PRESETS, int(usual))
+    told |= dict(zip(others[::2], map(int, others[1::2]), strict=True))
+    assert {name: own.dqn.replay_ratio for name, own in config.PRESETS.items()} == told
+
+
+def test_the_configs_that_pages_name_exist() -> None:
+    pages = [*PAGES, REPO / "CHANGELOG.md", REPO / "ARCHITECTURE.md"]
+    named = set(re.findall(r"`(\w*Config)\b", "".join(page.read_text() for page in pages)))
+    assert "RandomizationConfig" in named
+    assert not [name for name in named if not hasattr(config, name)]
+
+
 def test_every_key_of_a_robots_file_is_explained() -> None:
     page = (DOCS / "robots.md").read_text()
     keys = {f.name for kind in (RobotFile, LegFile) for f in dataclasses.fields(kind)}

@@ -1,6 +1,7 @@
 """The house: a module imports only from lower floors, read from its syntax tree."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import mjx_balance
 
 PACKAGE = Path(mjx_balance.__file__).resolve().parent
+PAGE = PACKAGE.parent / "ARCHITECTURE.md"
 
 FLOORS = (
     tuple("errors quiet sources gym_registration runtime".split()),
@@ -111,6 +113,29 @@ def test_module_imports_only_from_lower_floors(name: str) -> None:
         assert floor is not None, f"{name} has no floor yet"
         assert below is not None, f"{name} imports {target}, which has no floor yet"
         assert below < floor, f"{name} (floor {floor}) imports {target} (floor {below})"
+
+
+def told_floors() -> dict[str, int]:
+    """Floors of ARCHITECTURE.md by module, or by folder with a dot at its end."""
+    floors = {}
+    for floor, places in re.findall(r"^\| (\d) \| (.+?) \|", PAGE.read_text(), re.MULTILINE):
+        for place in re.findall(r"`([\w/]+?)(?:\.py|(?<=/))`", places):
+            floors[place.replace("/", ".")] = int(floor)
+    return floors
+
+
+def told_floor(name: str) -> int:
+    """Where ARCHITECTURE.md puts a module: by its own name, or else by its folder's."""
+    floors = told_floors()
+    found = floors.get(name, floors.get(f"{name.split('.')[0]}."))
+    assert found is not None, f"ARCHITECTURE.md says nothing of {name}"
+    return found
+
+
+@pytest.mark.parametrize("name", [name for name in INSIDE if name != "__main__"])
+def test_the_architecture_puts_no_module_below_what_it_imports(name: str) -> None:
+    for target in imported_modules(name):
+        assert told_floor(target) <= told_floor(name), f"{name} imports {target}"
 
 
 @pytest.mark.parametrize("name", [name for name in INSIDE if name.startswith("dqn")])

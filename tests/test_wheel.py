@@ -43,6 +43,8 @@ def test_what_is_in_it(wheel: Path) -> None:
     wanted = {f"mjx_balance/{name}" for name in wanted}
     assert wanted <= names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "docs/"))]
+    policies = {name for name in names if name.startswith("mjx_balance/policies/")}
+    assert policies == {name for name in wanted if name.endswith(".safetensors")}
     assert wheel.stat().st_size <= MOST_BYTES
 
 
