@@ -21,6 +21,7 @@ def with_legs(robot: Robot, **changes: Any) -> Robot:
 
 LEGS = ("LF", "RF", "LH", "RH")
 JOINTS = ("abduction", "hip", "knee")
+INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def file_text(model: Path, legs: Sequence[str] = LEGS, **extra: str) -> str:
@@ -120,3 +121,40 @@ def with_motors(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     spec.option.timestep, spec.option.impratio = 0.001, 100
     spec.site("imu").quat = [0.6, 0, 0, 0.8]
     return spec
+
+
+def urdf_text(root: str = "trunk") -> str:
+    """Our robot's legs and masses as a URDF; a root of another name is a link without weight."""
+
+    def link(name: str, mass: float, shape: str = "") -> str:
+        same = " ".join(f'{i}="{0.01 * (i[1] == i[2])}"' for i in INERTIA)
+        inertial = f'<inertial><mass value="{mass}"/><inertia {same}/></inertial>'
+        solid = f"<collision><geometry>{shape}</geometry></collision>" if shape else ""
+        return f'<link name="{name}">{inertial}{solid}</link>'
+
+    def joint(name: str, ends: tuple[str, str], place: str, turns: str = "") -> str:
+        kind = "revolute" if turns else "fixed"
+        parent, child = ends
+        return (
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{place}"/>{turns}</joint>'
+        )
+
+    def turns(axis: str, low: float, high: float, torque: float) -> str:
+        limit = f'lower="{low}" upper="{high}" effort="{torque}" velocity="20"'
+        return f'<axis xyz="{axis}"/><limit {limit}/>'
+
+    parts = [link("trunk", 6.92, '<box size="0.3 0.1 0.1"/>')]
+    if root != "trunk":
+        parts += [f'<link name="{root}"/>', joint("stand", (root, "trunk"), "0 0 0")]
+    for name, x, y in (("LF", 1, 1), ("RF", 1, -1), ("LH", -1, 1), ("RH", -1, -1)):
+        hip, thigh, calf, tip = (f"{name}_{part}" for part in ("hip", "thigh", "calf", "tip"))
+        parts += [link(hip, 0.68), link(thigh, 1.15), link(calf, 0.2)]
+        parts += [link(tip, 0.04, '<sphere radius="0.022"/>')]
+        place, knee = f"{0.193 * x} {0.0465 * y} 0", turns("0 1 0", -2.72, -0.838, 45.4)
+        parts += [joint(f"{name}_abduction", ("trunk", hip), place, turns("1 0 0", -1, 1, 23.7))]
+        place = f"0 {0.0955 * y} 0"
+        parts += [joint(f"{name}_hip", (hip, thigh), place, turns("0 1 0", -1.5, 3.4, 23.7))]
+        parts += [joint(f"{name}_knee", (thigh, calf), "0 0 -0.213", knee)]
+        parts += [joint(f"{name}_tip", (calf, tip), "0 0 -0.213")]
+    return f'<robot name="ours">{"".join(parts)}</robot>'

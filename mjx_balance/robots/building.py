@@ -69,11 +69,28 @@ def _menagerie(name: str) -> Path:
 
 
 def read_model(path: Path) -> mujoco.MjSpec:
-    """Reads a model file; raises `RobotError` with MuJoCo's own words."""
+    """Reads a model file, to be compiled as it is written: nothing is dropped or fused on the way.
+
+    A URDF's root gets the free joint that such files rarely have.
+
+    Raises:
+      RobotError: with MuJoCo's own words.
+    """
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise RobotError(f"{path} cannot be read: {_first_line(error)}") from error
+        raise RobotError(f"{path} cannot be read: {words(error)}") from error
+    spec.compiler.discardvisual = spec.compiler.fusestatic = False  # a URDF's are true
+    if path.suffix.lower() == ".urdf":
+        for root in spec.worldbody.bodies:
+            if not root.joints:
+                root.add_freejoint()
+    return spec
+
+
+def words(error: Exception) -> str:
+    """MuJoCo's, in one line: those after the first name the element."""
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
 def build(file: RobotFile, visual: bool = False) -> tuple[mujoco.MjSpec, Robot]:
@@ -97,7 +114,7 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     trunk = _find(spec.bodies, file.trunk, "trunk", "bodies")
     free = [j for j in trunk.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
-        raise RobotError(f"trunk {file.trunk!r} has no free joint; it must be free to move")
+        raise RobotError(f"trunk {file.trunk!r} has no free joint; {_remedy(trunk)}")
     _strip(spec, trunk, file)
     feet = {leg.name: _foot(spec, leg.foot, leg.name) for leg in file.legs}
     radius = _foot_radius(file, feet)
@@ -117,15 +134,21 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     return spec, robot
 
 
+def _remedy(trunk: mujoco.MjsBody) -> str:
+    """What to do about a trunk that is not free."""
+    root = trunk
+    while root.parent.name != "world":
+        root = root.parent
+    if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in root.joints):
+        return f"it hangs on body {root.name!r}, which has one and is the trunk"
+    return "it must be free to move; give it a <freejoint/> in its model"
+
+
 def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise RobotError(f"its model cannot be compiled: {_first_line(error)}") from error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or ["no reason given"])[0]
+        raise RobotError(f"its model cannot be compiled: {words(error)}") from error
 
 
 def _find(elements: list, name: str, what: str, kind: str):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.robots.building import read_model
+from mjx_balance.robots.building import read_model, words
 from mjx_balance.robots.file import RobotError
 from mjx_balance.robots.measuring import ancestors
 
@@ -52,7 +52,7 @@ def draft(model: str, path: Path) -> str:
     try:
         compiled = spec.compile()
     except ValueError as error:
-        raise RobotError(f"{path} cannot be compiled: {str(error).splitlines()[0]}") from error
+        raise RobotError(f"{path} cannot be compiled: {words(error)}") from error
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
     trunk = _trunk(compiled, path)

@@ -13,6 +13,8 @@ from mjx_balance.config import Config, ConfigError, check, fitted, preset
 from mjx_balance.controllers import make_controller, measure_response
 from mjx_balance.evaluation import run_suite
 from mjx_balance.robots import Robot, RobotError, find_robot, robot_spec, shipped
+from mjx_balance.robots.building import scene_dir
+from mjx_balance.robots.draft import draft
 from mjx_balance.scene import ROBOT, Scene, load_scene
 from mjx_balance.task.kinematics import foot_heights, joint_angles
 
@@ -437,6 +439,26 @@ def _axis(joint: str, axis: list[float]) -> mujoco.MjSpec:
     spec = bodies.our_spec()
     spec.joint(joint).axis = axis
     return spec
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name="LF_knee" class="knee"/>', 'nom="LF_knee"/>', "'nom'; Element 'joint', line "),
+        ("0.0012 0.0012", "1 0.0012", "cannot be compiled: .*inertia .*; Element name 'LF_calf'"),
+    ],
+)
+def test_mujocos_words_name_the_element(tmp_path: Path, old: str, new: str, message: str) -> None:
+    """In one line: it writes them below its complaint."""
+    text = (scene_dir() / "quadruped.xml").read_text()
+    (tmp_path / "model.xml").write_text(swapped(old, new)(text))
+    (tmp_path / "maker.toml").write_text(bodies.file_text(Path("model.xml")))
+    with pytest.raises(RobotError, match=message) as caught:
+        find_robot(str(tmp_path / "maker.toml"))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(RobotError, match="Element") as caught:
+        draft("model.xml", tmp_path / "model.xml")
+    assert "\n" not in str(caught.value)
 
 
 def test_too_heavy_for_its_servos(tmp_path: Path) -> None:

@@ -9,10 +9,12 @@ import bodies
 import mujoco
 import pytest
 
+from mjx_balance.config import check, fitted, preset
 from mjx_balance.robots import Robot, RobotError, find_robot, shipped
 from mjx_balance.robots.building import build, model_path
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.file import parse_robot_file
+from mjx_balance.scene import load_scene
 
 MAKERS = tuple(name for name in shipped() if name != "quadruped")
 
@@ -96,6 +98,31 @@ def test_one_that_looks_along_y(tmp_path: Path, robot: Robot) -> None:
     assert (found.half_length, found.half_track) == pytest.approx((0.193, 0.142))
     for leg in found.legs:
         assert (leg.name[1] == "L", leg.name[0] == "F") == (leg.left, leg.front)
+
+
+@pytest.mark.parametrize("root", ["trunk", "base_footprint"])
+def test_a_urdf(root: str, tmp_path: Path, robot: Robot) -> None:
+    """Its root is not said to be free, its feet are shapes on links that nothing moves."""
+    (tmp_path / "model.urdf").write_text(bodies.urdf_text(root))
+    text = draft("model.urdf", tmp_path / "model.urdf")
+    assert f'trunk = "{root}"' in text
+    (tmp_path / "drafted.toml").write_text(text)
+    name = str(tmp_path / "drafted.toml")
+    found = find_robot(name)
+    assert (found.hip_torque, found.knee_torque, found.foot_radius) == (23.7, 45.4, 0.022)
+    assert (found.total_mass, found.trunk_mass) == pytest.approx((15.2, 6.92))
+    for leg, ours in zip(found.legs, robot.legs, strict=True):
+        for field in ("x", "y", "thigh", "calf", "knee", "signs", "zeros"):
+            assert getattr(leg, field) == pytest.approx(getattr(ours, field), abs=1e-9), field
+    load_scene(check(fitted(preset("default"), name)))
+
+
+def test_a_urdfs_trunk_is_its_root(tmp_path: Path) -> None:
+    (tmp_path / "model.urdf").write_text(bodies.urdf_text("base_footprint"))
+    text = draft("model.urdf", tmp_path / "model.urdf")
+    text = text.replace('trunk = "base_footprint"', 'trunk = "trunk"')
+    with pytest.raises(RobotError, match="it hangs on body 'base_footprint', which has one"):
+        build(parse_robot_file(text, tmp_path / "drafted.toml"))
 
 
 def test_what_is_no_quadruped_is_refused(tmp_path: Path) -> None:
