@@ -7,7 +7,7 @@ left out; in their place come position servos, an IMU and four spheres as feet.
 import importlib.util
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -115,11 +115,11 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     free = [j for j in trunk.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         raise RobotError(f"trunk {file.trunk!r} has no free joint; {_remedy(trunk)}")
+    _keep_inertia(spec, trunk)
     _strip(spec, trunk, file)
     feet = {leg.name: _foot(spec, leg.foot, leg.name) for leg in file.legs}
     radius = _foot_radius(file, feet)
-    _keep_inertia(spec, trunk)
-    spheres = [_sphere(foot, name, radius) for name, foot in feet.items()]
+    spheres = _spheres(spec, feet, radius)
     names = [sphere.name for sphere in spheres]
     _leave_geoms(spec, trunk, spheres, visual)
     # A foot on a body of its own, with no joint, would slide more: MuJoCo sets friction's softness
@@ -162,60 +162,87 @@ def _find(elements: list, name: str, what: str, kind: str):
 
 def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
     """Removes what the file asks for, and everything around the robot."""
-    for name in file.strip:
-        bodies = [b for b in spec.bodies if b.name == name]
-        joints = [j for j in spec.joints if j.name == name]
-        if not bodies and not joints:
-            raise RobotError(f"strip names {name!r}, which is no body and no joint of its model")
-        _forget_moved(spec, name)
-        for element in (*bodies, *joints):
-            spec.delete(element)
+    bodies, joints = _stripped(spec, trunk, file)
+    gone = {joint.name for body in bodies for joint in _joints_below(body)}
+    gone |= {joint.name for joint in joints}
+    for leg in file.legs:
+        for joint in [x for x in leg.joints if x in gone]:
+            raise RobotError(f"strip takes joint {joint!r} of leg {leg.name}, which the leg needs")
+    usual = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    for actuator in [a for a in spec.actuators if a.trntype not in usual or a.target in gone]:
+        spec.delete(actuator)
+    # What refers to others goes before them.
+    refer = [*spec.keys, *spec.sensors, *spec.excludes, *spec.pairs, *spec.equalities]
+    refer += [*spec.tuples, *spec.tendons, *spec.skins, *spec.flexes]
+    for element in (*refer, *joints):
+        spec.delete(element)
+    for body in bodies:
+        spec.delete(body)
     world = spec.worldbody
     around = [b for b in world.bodies if b.name != trunk.name]
     around += [*world.geoms, *world.sites, *spec.lights, *spec.cameras]
-    around += [*spec.keys, *spec.sensors, *spec.excludes, *spec.pairs, *spec.equalities]
     for element in around:
         spec.delete(element)
-    usual = mujoco.MjSpec()
+    fresh = mujoco.MjSpec()
     for size in ("nkey", "nconmax", "njmax", "nuserdata", "memory"):
-        setattr(spec, size, getattr(usual, size))
+        setattr(spec, size, getattr(fresh, size))
 
 
-def _forget_moved(spec: mujoco.MjSpec, name: str) -> None:
-    """Drops the actuators of a joint, or of all joints of a body and below it."""
-    joints = {name}
-    for body in spec.bodies:
-        if body.name == name:
-            below = [body, *body.find_all(mujoco.mjtObj.mjOBJ_BODY)]
-            joints |= {j.name for x in below for j in x.joints}
-    for actuator in [a for a in spec.actuators if a.target in joints]:
-        spec.delete(actuator)
+def _stripped(
+    spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile
+) -> tuple[list[mujoco.MjsBody], list[mujoco.MjsJoint]]:
+    """Bodies and joints that the file wants gone, none of them below one of the bodies."""
+    carries, body = {"world"}, trunk
+    while body.name != "world":
+        carries.add(body.name)
+        body = body.parent
+    bodies = {b.name: b for b in spec.bodies if b.name in file.strip}
+    joints = {j.name: j for j in spec.joints if j.name in file.strip}
+    for name in file.strip:
+        if name not in bodies and name not in joints:
+            raise RobotError(f"strip names {name!r}, which is no body and no joint of its model")
+        if name in carries:
+            raise RobotError(f"strip names {name!r}, which is, or carries, the trunk")
+        if name in [j.name for j in trunk.joints]:
+            raise RobotError(f"strip names {name!r}, by which the trunk is free; it must be")
+    below = {x.name for b in bodies.values() for x in b.find_all(mujoco.mjtObj.mjOBJ_BODY)}
+    outer = [b for b in bodies.values() if b.name not in below]
+    gone = {j.name for b in outer for j in _joints_below(b)}
+    return outer, [j for j in joints.values() if j.name not in gone]
+
+
+def _joints_below(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
+    """Of a body and of all that hangs on it."""
+    return [j for x in (body, *body.find_all(mujoco.mjtObj.mjOBJ_BODY)) for j in x.joints]
 
 
 class _Found(NamedTuple):
     """A foot in its model."""
 
     body: mujoco.MjsBody
-    pos: np.ndarray
-    """(3,) in the body's frame, m."""
-    sphere: mujoco.MjsGeom | None
-    """The geom, if it is one."""
+    pos: tuple[float, float, float]
+    """In the body's frame, m; of a geom or a site only its compiled model knows."""
+    element: mujoco.MjsGeom | mujoco.MjsSite | None
+    """The geom or site, if it is one."""
+
+    @property
+    def sphere(self) -> mujoco.MjsGeom | None:
+        """The geom, if it is a sphere."""
+        geom = self.element if isinstance(self.element, mujoco.MjsGeom) else None
+        return geom if geom and geom.type == mujoco.mjtGeom.mjGEOM_SPHERE else None
 
 
 def _foot(spec: mujoco.MjSpec, foot: Foot, leg: str) -> _Found:
+    origin = (0.0, 0.0, 0.0)
     if foot.offset is not None:
         body = _find(spec.bodies, foot.name, f"foot of leg {leg}", "bodies")
-        return _Found(body, np.asarray(foot.offset), None)
-    for geom in spec.geoms:
-        if geom.name == foot.name:
-            sphere = geom if geom.type == mujoco.mjtGeom.mjGEOM_SPHERE else None
-            return _Found(geom.parent, np.array(geom.pos), sphere)
-    for site in spec.sites:
-        if site.name == foot.name:
-            return _Found(site.parent, np.array(site.pos), None)
+        return _Found(body, foot.offset, None)
+    for element in (*spec.geoms, *spec.sites):
+        if element.name == foot.name:
+            return _Found(element.parent, origin, element)
     for body in spec.bodies:
         if body.name == foot.name:
-            return _Found(body, np.zeros(3), None)
+            return _Found(body, origin, None)
     raise RobotError(
         f"foot of leg {leg} is {foot.name!r}, which is no geom, site or body of its model"
     )
@@ -224,21 +251,25 @@ def _foot(spec: mujoco.MjSpec, foot: Foot, leg: str) -> _Found:
 def _foot_radius(file: RobotFile, feet: dict[str, _Found]) -> float:
     if file.foot_radius is not None:
         return file.foot_radius
-    sizes = {name: foot.sphere.size[0] for name, foot in feet.items() if foot.sphere is not None}
+    sizes = {name: float(x.sphere.size[0]) for name, x in feet.items() if x.sphere is not None}
     missing = [name for name in feet if name not in sizes]
     if missing:
         raise RobotError(f"foot of leg {missing[0]} is not a sphere geom; say foot_radius, in m")
     if max(sizes.values()) - min(sizes.values()) > 1e-4:
-        raise RobotError(f"the feet have different radii, {sizes}; say foot_radius, in m")
-    return float(next(iter(sizes.values())))
+        listed = ", ".join(f"{name} {size:.4g}" for name, size in sizes.items())
+        raise RobotError(f"the feet have different radii, {listed}; say foot_radius, in m")
+    return next(iter(sizes.values()))
 
 
 def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
-    """Writes down what bodies get from geoms, which may go."""
+    """Writes down what bodies get from geoms, which may go, and from the compiler's options."""
     bodies = [trunk, *trunk.find_all(mujoco.mjtObj.mjOBJ_BODY)]
-    by_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    asked = [b for b in bodies if by_geoms or not b.explicitinertial]
-    if any(geom.mass != 0 for body in asked for geom in body.geoms):
+    compiler = spec.compiler
+    by_geoms = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    bounds = compiler.boundmass > 0 or compiler.boundinertia > 0
+    changed = compiler.settotalmass > 0 or bounds or compiler.balanceinertia
+    asked = [b for b in bodies if by_geoms or changed or not b.explicitinertial]
+    if changed or any(geom.mass != 0 for body in asked for geom in body.geoms):
         model = _compiled(spec)
         for body in asked:
             if model.body_mass[body.id]:
@@ -246,22 +277,60 @@ def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
                 body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
                 body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
                 body.explicitinertial = True
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    compiler.settotalmass, compiler.boundmass, compiler.boundinertia = -1, 0, 0
+    compiler.balanceinertia = False
 
 
-def _sphere(foot: _Found, leg: str, radius: float) -> mujoco.MjsGeom:
-    """The foot's own sphere, or a new one in its place."""
-    if foot.sphere is not None and abs(foot.sphere.size[0] - radius) < 1e-6:
-        return foot.sphere
-    size = [radius, 0, 0]
-    return foot.body.add_geom(
-        name=f"{leg}_contact",
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        pos=foot.pos,
-        size=size,
-        rgba=[0, 0, 0, 0],
-        mass=0,
-    )
+def _spheres(spec: mujoco.MjSpec, feet: dict[str, _Found], radius: float) -> list[mujoco.MjsGeom]:
+    """Of each leg, the foot's own sphere, or a new one in its place."""
+    own = {
+        name: foot.sphere
+        for name, foot in feet.items()
+        if foot.sphere is not None and abs(foot.sphere.size[0] - radius) < 1e-6
+    }
+    places = {name: foot.pos for name, foot in feet.items()}
+    drawn = {name: x.element for name, x in feet.items() if x.element and name not in own}
+    if drawn:  # frames, ends and meshes decide where they are
+        model = _compiled(spec)
+        for name, element in drawn.items():
+            geom = isinstance(element, mujoco.MjsGeom)
+            places[name] = (model.geom_pos if geom else model.site_pos)[element.id]
+    spheres = []
+    for name, foot in feet.items():
+        sphere = own.get(name)
+        if sphere is None:
+            sphere = foot.body.add_geom(name=_unused(spec.geoms, f"{name}_contact"))
+            _as_new(sphere, mujoco.MjSpec().worldbody.add_geom())
+            sphere.type = mujoco.mjtGeom.mjGEOM_SPHERE
+            sphere.pos, sphere.size, sphere.mass = places[name], [radius, 0, 0], 0
+            sphere.rgba = [0, 0, 0, 0]
+        spheres.append(sphere)
+    return spheres
+
+
+def _unused(elements: list, name: str) -> str:
+    """A name that none of them has."""
+    names = {element.name for element in elements}
+    while name in names:
+        name += "_"
+    return name
+
+
+def _as_new(element: Any, fresh: Any) -> None:
+    """Takes back what its maker's defaults say of an element.
+
+    Args:
+      element: a geom, site or actuator that was just added.
+      fresh: one of an empty model.
+    """
+    for field in dir(fresh):
+        value = getattr(fresh, field)
+        ours = field.startswith("_") or field in ("id", "signature", "name")
+        if not ours and (isinstance(value, str) or hasattr(value, "__int__")):
+            setattr(element, field, value)
+    if hasattr(fresh, "alt"):
+        element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 def _leave_geoms(
@@ -283,8 +352,8 @@ def _leave_geoms(
     for geom in shown:
         geom.group = VISUAL_GROUP
     if not visual:
-        for geom in feet:
-            geom.material = ""
+        for element in (*feet, *spec.sites):
+            element.material = ""
         for asset in (*spec.meshes, *spec.materials, *spec.textures, *spec.hfields):
             spec.delete(asset)
 
@@ -339,23 +408,26 @@ def _align(
 
 def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
     """Gives the robot its servos and its IMU."""
-    for element in [*spec.actuators, *spec.tendons]:
+    for element in [*spec.actuators]:
         spec.delete(element)
+    for body in spec.bodies:
+        body.gravcomp = 0
     for joint in spec.joints:
         driven = joint.type != mujoco.mjtJoint.mjJNT_FREE
         joint.damping = [robot.servo_damping * driven, 0, 0]
         joint.armature = robot.servo_armature * driven
         joint.stiffness, joint.frictionloss = [0, 0, 0], 0
+        joint.springdamper, joint.actgravcomp = [0, 0], False
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     for leg in robot.legs:
         torques = (robot.hip_torque, robot.hip_torque, robot.knee_torque)
         for name, torque in zip(leg.joints, torques, strict=True):
-            servo = spec.add_actuator(
-                name=name,
-                target=name,
-                trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
-                forcerange=[-torque, torque],
+            servo = spec.add_actuator(name=name)
+            _as_new(servo, mujoco.MjSpec().add_actuator())
+            servo.target, servo.trntype = name, mujoco.mjtTrn.mjTRN_JOINT
+            servo.forcelimited, servo.forcerange = (
+                mujoco.mjtLimited.mjLIMITED_TRUE,
+                [-torque, torque],
             )
             servo.set_to_position(kp=robot.servo_stiffness)
     for name, kind in (
@@ -377,5 +449,7 @@ def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file
         if np.allclose(site.quat, (1, 0, 0, 0)):
             return site.name
         place = site.pos
-    trunk.add_site(name=IMU, pos=place)
-    return IMU
+    added = trunk.add_site(name=_unused(spec.sites, IMU))
+    _as_new(added, mujoco.MjSpec().worldbody.add_site())
+    added.pos = place
+    return added.name

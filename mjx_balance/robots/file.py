@@ -134,7 +134,7 @@ def _parsed(path: Path, values: dict[str, Any]) -> RobotFile:
     elif imu is not None and not isinstance(imu, str):
         raise RobotError(f"imu is {imu!r}; it must be a site, or a place [x, y, z] in m")
     strip = values.get("strip", [])
-    if not isinstance(strip, list) or not all(isinstance(x, str) for x in strip):
+    if not isinstance(strip, list) or not all(isinstance(x, str) and x for x in strip):
         raise RobotError(f"strip is {strip!r}; it must list bodies and joints")
     values |= {"legs": parsed, "strip": tuple(strip)}
     return RobotFile(name=path.stem, folder=path.absolute().parent, **values)

@@ -335,6 +335,161 @@ def test_what_is_stripped_is_gone_or_fixed(tmp_path: Path) -> None:
     assert find_robot(written(tmp_path, strip_spec(), text)).total_mass == pytest.approx(15.7)
 
 
+@pytest.mark.parametrize(
+    ("strip", "mass"),
+    [
+        ('["arm"]', 15.2),
+        ('["hand", "arm", "arm", "finger"]', 15.2),
+        ('["arm_joint", "hand", "thumb"]', 16.2),
+        ('["arm_joint", "hand_joint", "thumb", "finger"]', 17.2),
+    ],
+)
+def test_an_arm_goes_with_all_that_refers_to_it(tmp_path: Path, strip: str, mass: float) -> None:
+    """Arm and hand of 1 kg each, a tendon of two joints and what pulls at them."""
+    arm = """
+      <body name="arm" pos="0.1 0 0.1">
+        <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+        <joint name="arm_joint" type="hinge"/>
+        <body name="hand" pos="0 0 0.1">
+          <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+          <joint name="hand_joint" type="hinge"/>
+          <joint name="finger" type="slide"/>
+          <site name="palm" material="shell"/>
+          <joint name="thumb" type="slide" axis="0 1 0"/>
+        </body>
+      </body>"""
+    refer = """
+      <tendon>
+        <fixed name="grip"><joint joint="finger" coef="1"/><joint joint="thumb" coef="1"/></fixed>
+        <spatial name="string" material="shell"><site site="palm"/><site site="imu"/></spatial>
+      </tendon>
+      <equality><joint joint1="finger" joint2="thumb"/></equality>
+      <custom><tuple name="two"><element objtype="site" objname="palm"/></tuple></custom>
+      <contact><exclude body1="arm" body2="trunk"/></contact>
+      <actuator>
+        <motor name="arm_motor" joint="arm_joint"/><motor name="grip" tendon="grip"/>
+        <general name="push" site="palm"/>
+      </actuator>"""
+    name = edited(
+        tmp_path,
+        [(LEFT_LEG, arm + LEFT_LEG), ("<sensor>", refer + "<sensor>")],
+        strip=strip,
+    )
+    assert find_robot(name).total_mass == pytest.approx(mass)
+    assert scene_of(name).model.ntendon == 0
+
+
+LEFT_LEG = '<body name="LF_hip"'
+LEFTOVERS = {
+    "servos": ("<default>", '<default><motor gear="9" ctrllimited="true" ctrlrange="-1 1"/>'),
+    "geoms": ("<geom contype", '<geom euler="0.3 0 0" material="shell" contype'),
+    "springs": ('armature="0.02"', 'armature="0.02" springdamper="0.1 1"'),
+    "floating bodies": ('<body name="trunk"', '<body name="trunk" gravcomp="1"'),
+    "site's material": ('<site name="imu"', '<site name="imu" material="shell"'),
+    "name of a foot": ('name="LF_rubber"', 'name="LF_contact"'),
+    "tuples": (
+        "<sensor>",
+        '<custom><tuple name="a"><element objtype="geom" objname="head"/></tuple></custom><sensor>',
+    ),
+    "tendons": (
+        "<sensor>",
+        '<tendon><spatial name="string" material="shell"><site site="imu"/><site site="LF_foot"/>'
+        '</spatial></tendon><actuator><motor name="pull" tendon="string"/></actuator><sensor>',
+    ),
+}
+
+
+def edited(folder: Path, edits: list[tuple[str, str]], **extra: str) -> str:
+    """Path of the file of a robot that is ours with a few words of its model changed."""
+    folder.mkdir(exist_ok=True)
+    text = (scene_dir() / "quadruped.xml").read_text()
+    for old, new in edits:
+        text = swapped(old, new)(text)
+    (folder / "model.xml").write_text(text)
+    (folder / "maker.toml").write_text(bodies.file_text(Path("model.xml"), **extra))
+    return str(folder / "maker.toml")
+
+
+@pytest.mark.parametrize("left", LEFTOVERS)
+def test_nothing_of_the_makers_is_left(tmp_path: Path, left: str) -> None:
+    """The scene is that of a model without it."""
+    extra = {"foot_radius": "0.03", "hip_torque": "20", "knee_torque": "40"}
+    name = edited(tmp_path / "left", [LEFTOVERS[left]], **extra)
+    plain = edited(tmp_path / "plain", [], **extra)
+    assert scene_of(name).hash == scene_of(plain).hash
+    found, expected = find_robot(name), find_robot(plain)
+    legs = zip(found.legs, expected.legs, strict=True)
+    same = [dataclasses.replace(leg, foot=x.foot) for leg, x in legs]
+    assert dataclasses.replace(found, legs=tuple(same)) == expected
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        ("<default>", '<default><site euler="0 1.5 0" pos="1 2 3" material="shell"/>'),
+        ('<site name="imu"', '<site name="balance_imu" pos="0.1 0 0" euler="0 1 0"/><site'),
+    ],
+)
+def test_the_imu_is_ours(tmp_path: Path, edit: tuple[str, str]) -> None:
+    """At the trunk's origin, along its axes, whatever sites are in its maker's model."""
+    scene = scene_of(edited(tmp_path, [edit]))
+    model = scene.model
+    for name in ("gyro", "accelerometer"):
+        site = int(model.sensor(f"{ROBOT}{name}").objid[0])
+        assert model.site_pos[site].tolist() == [0, 0, 0]
+        assert model.site_quat[site].tolist() == [1, 0, 0, 0]
+    np.testing.assert_allclose(scene.stance.imu, [0, 0, 0, 0, 0, 9.81], atol=0.01)
+
+
+FEET = {
+    "site in a frame": '<frame pos="0 0 -0.2"><site name="{}" pos="0 0 -0.013"/></frame>',
+    "cylinder in a frame": (
+        '<frame pos="0 0 -0.213" euler="0 1 0"><geom name="{}" type="cylinder" size="0.02 0.01"/>'
+        "</frame>"
+    ),
+    "capsule between ends": (
+        '<geom name="{}" type="capsule" size="0.01" fromto="0 -0.02 -0.213 0 0.02 -0.213"/>'
+    ),
+    "sphere of another size": '<frame pos="0 0 -0.213"><geom name="{}" size="0.04"/></frame>',
+    "body": '<body name="{}" pos="0 0 -0.213"/>',
+}
+
+
+@pytest.mark.parametrize("kind", FEET)
+def test_a_foot_is_where_its_model_draws_it(kind: str, tmp_path: Path, robot: Robot) -> None:
+    """0.213 m below the knee, whatever it is and whatever its place is relative to."""
+    edits = []
+    for leg in bodies.LEGS:
+        old = f'<geom name="{leg}_rubber"'
+        edits += [(old, FEET[kind].format(f"{leg}_paw") + old)]
+    feet = {leg: f'foot = "{leg}_paw"' for leg in bodies.LEGS}
+    name = edited(tmp_path, edits, foot_radius="0.022", **feet)
+    path = Path(name)
+    lines = [x for x in path.read_text().splitlines() if not x.endswith('_foot"')]
+    path.write_text("\n".join(lines))
+    for leg, ours in zip(find_robot(name).legs, robot.legs, strict=True):
+        assert (leg.calf, leg.x, leg.y) == pytest.approx((0.213, ours.x, ours.y), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("option", "total", "trunk"),
+    [
+        ('settotalmass="30.4"', 30.4, 2 * 6.92),
+        ('boundmass="0.68"', 15.2 + 4 * (0.68 - 0.24), 6.92),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:compiler attribute")
+def test_masses_are_what_the_compiler_makes_them(
+    tmp_path: Path, option: str, total: float, trunk: float
+) -> None:
+    """In the scene too, whose compiler has no such options."""
+    name = edited(tmp_path, [("<compiler ", f"<compiler {option} ")])
+    robot, model = find_robot(name), scene_of(name).model
+    assert (robot.total_mass, robot.trunk_mass) == pytest.approx((total, trunk))
+    assert model.body(f"{ROBOT}trunk").mass[0] == pytest.approx(trunk)
+    assert model.body(f"{ROBOT}trunk").subtreemass[0] == pytest.approx(total)
+
+
 def heavy_spec() -> mujoco.MjSpec:
     spec = bodies.our_spec()
     spec.body("trunk").mass = 400
@@ -396,6 +551,16 @@ def swapped(old: str, new: str) -> Callable[[str], str]:
         ),
         (strip_spec, str, "joint 'neck_joint' is in no leg; strip it"),
         (strip_spec, swapped("trunk =", 'strip = ["nose"]\ntrunk ='), "strip names 'nose', which"),
+        *(
+            (bodies.our_spec, swapped("trunk =", f'strip = ["{name}"]\ntrunk ='), message)
+            for name, message in (
+                ("world", "strip names 'world', which is, or carries, the trunk"),
+                ("trunk", "strip names 'trunk', which is, or carries, the trunk"),
+                ("root", "strip names 'root', by which the trunk is free; it must be"),
+                ("LF_knee", "strip takes joint 'LF_knee' of leg LF, which the leg needs"),
+                ("LF_thigh", "strip takes joint 'LF_hip' of leg LF, which the leg needs"),
+            )
+        ),
         (short_spec, str, "too short for the board: its legs reach from 0.3"),
         (
             lambda: _axis("RF_knee", [0, 0, 1]),

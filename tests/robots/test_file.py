@@ -68,6 +68,7 @@ def test_everything_is_read(tmp_path: Path) -> None:
         ("[0.1, 0, -0.02]", "true", "imu is True; it must be a site, or a place"),
         ("[0.1, 0, -0.02]", "[0.1, 0, nan]", r"imu is at \[0.1, 0, nan\]"),
         ('["head"]', '"head"', "strip is 'head'; it must list bodies and joints"),
+        ('["head"]', '["head", ""]', r"strip is \['head', ''\]; it must list bodies and joints"),
         ("= 30", "= 0", "knee_torque is 0; it must be a number above 0"),
         ("= 30", '= "30"', "knee_torque is '30'; it must be a number above 0"),
         ("= 30", "= inf", "knee_torque is inf"),
