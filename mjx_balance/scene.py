@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.config import Config, ConfigError
-from mjx_balance.robots import Robot, find_robot, robot_spec
+from mjx_balance.robots import Robot, find_robot, robot_file, robot_spec
 from mjx_balance.robots.building import (
     ACCELEROMETER,
     GYRO,
@@ -206,7 +206,7 @@ def settle(
             )
         raise ConfigError(
             f"robot {robot.name} does not stand still at body_height {task.body_height} m with "
-            f"servo_stiffness {robot.servo_stiffness} N m/rad; try the defaults"
+            f"servo_stiffness {robot.servo_stiffness:g} N m/rad: {_why(config, robot, model, root)}"
         )
     return Stance(
         qpos=data.qpos.copy(),
@@ -215,6 +215,30 @@ def settle(
         leg_trim=trim,
         imu=data.sensordata[imu].copy(),
     )
+
+
+def _why(config: Config, robot: Robot, model: mujoco.MjModel, root: int) -> str:
+    """What keeps a robot from standing, as far as one can tell."""
+    data = mujoco.MjData(model)
+    data.qpos[root + 3] = 1
+    mujoco.mj_forward(model, data)
+    trunk = model.body(f"{ROBOT}{robot.trunk}").id
+    for axis, centre, one, other in zip(
+        "xy", data.subtree_com[trunk], ("ahead", "left"), ("behind", "right"), strict=False
+    ):
+        feet = robot.each(axis)
+        if not feet.min() < centre < feet.max():
+            way = one if centre > feet.max() else other
+            return (
+                f"its centre of mass is {1000 * abs(centre):.0f} mm {way} of the trunk's origin, "
+                f"and its feet stand from {1000 * feet.min():.0f} to {1000 * feet.max():.0f} mm"
+            )
+    file = robot_file(config.robot)
+    names = ("servo_stiffness", "servo_damping", "servo_armature", "body_height")
+    said = [name for name in names if getattr(file, name) is not None]
+    if said:
+        return f"leave out {', '.join(said)} of its file, and the rules give others"
+    return "neither its centre of mass nor its file says why; look at its picture"
 
 
 _HASHED = (

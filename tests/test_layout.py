@@ -13,7 +13,8 @@ PAGE = PACKAGE.parent / "ARCHITECTURE.md"
 
 FLOORS = (
     tuple("errors quiet sources gym_registration runtime".split()),
-    ("robots.record", "robots.file"),
+    ("robots.record",),
+    ("robots.file",),
     ("robots.measuring",),
     ("robots.building",),
     ("robots.draft",),

@@ -19,6 +19,8 @@ from mjx_balance.robots.record import Robot
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
 IMU = "balance_imu"
+ALIKE = 1e-4
+"""What feet's radii may differ by, m."""
 
 
 def scene_dir() -> Path:
@@ -42,15 +44,24 @@ def model_path(model: str, folder: Path) -> Path:
     elif where == "menagerie":
         path = _menagerie(inside)
     else:
-        spec = importlib.util.find_spec(where)
-        if spec is None or not spec.submodule_search_locations:
-            raise RobotError(
-                f"model is {model!r}, but the Python package {where!r} is not installed"
-            )
-        path = Path(spec.submodule_search_locations[0]) / inside
-    if not path.is_file():
+        path = _package(where, model) / inside
+    if "\0" in model or not path.is_file():
         raise RobotError(f"model is {model!r}, but there is no file {path}")
     return path
+
+
+def _package(name: str, model: str) -> Path:
+    """Folder of an installed Python package."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):  # of a package that is not there; of no package's name
+        spec = None
+    if spec is None or not spec.submodule_search_locations:
+        raise RobotError(
+            f"model is {model!r}, but the Python package {name!r} is not installed; before a colon "
+            "stands a package, and a file's path has none"
+        )
+    return Path(spec.submodule_search_locations[0])
 
 
 def _menagerie(name: str) -> Path:
@@ -111,7 +122,7 @@ def build(file: RobotFile, visual: bool = False) -> tuple[mujoco.MjSpec, Robot]:
 
 def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     spec = read_model(model_path(file.model, file.folder))
-    trunk = _find(spec.bodies, file.trunk, "trunk", "bodies")
+    trunk = _find(spec.bodies[1:], file.trunk, "trunk", "bodies")
     free = [j for j in trunk.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         raise RobotError(f"trunk {file.trunk!r} has no free joint; {_remedy(trunk)}")
@@ -155,7 +166,7 @@ def _find(elements: list, name: str, what: str, kind: str):
     for element in elements:
         if element.name == name:
             return element
-    names = [x.name for x in elements if x.name and x.name != "world"]
+    names = [x.name for x in elements if x.name]
     shown = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
     raise RobotError(f"{what} is {name!r}, which its model does not have; its {kind}: {shown}")
 
@@ -235,7 +246,7 @@ class _Found(NamedTuple):
 def _foot(spec: mujoco.MjSpec, foot: Foot, leg: str) -> _Found:
     origin = (0.0, 0.0, 0.0)
     if foot.offset is not None:
-        body = _find(spec.bodies, foot.name, f"foot of leg {leg}", "bodies")
+        body = _find(spec.bodies[1:], foot.name, f"foot of leg {leg}", "bodies")
         return _Found(body, foot.offset, None)
     for element in (*spec.geoms, *spec.sites):
         if element.name == foot.name:
@@ -255,7 +266,7 @@ def _foot_radius(file: RobotFile, feet: dict[str, _Found]) -> float:
     missing = [name for name in feet if name not in sizes]
     if missing:
         raise RobotError(f"foot of leg {missing[0]} is not a sphere geom; say foot_radius, in m")
-    if max(sizes.values()) - min(sizes.values()) > 1e-4:
+    if max(sizes.values()) - min(sizes.values()) > ALIKE:
         listed = ", ".join(f"{name} {size:.4g}" for name, size in sizes.items())
         raise RobotError(f"the feet have different radii, {listed}; say foot_radius, in m")
     return next(iter(sizes.values()))
@@ -383,6 +394,7 @@ def _align(
         if len(front) != 2:
             raise RobotError(f"{len(front)} legs have end front; two must, and two hind")
         forward = np.mean(front, axis=0) - np.mean(hind, axis=0)
+        _check_ends(file, hips, pose)
     quarters = round(math.degrees(math.atan2(forward[1], forward[0])) / 90)
     trunk.pos, trunk.quat = [0, 0, 0], [1, 0, 0, 0]
     trunk.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -404,6 +416,19 @@ def _align(
         if element.frame is None:
             element.set_frame(turned)
     return True
+
+
+def _check_ends(file: RobotFile, hips: dict[str, np.ndarray], pose: Pose) -> None:
+    """Front legs stand at one end, hind legs at the other: the ends that abductions turn about."""
+    turns = [np.abs(pose.axis(leg.joints[0])[:2]) for leg in file.legs]
+    along = int(np.argmax(np.sum(turns, axis=0)))
+    middle = np.mean(list(hips.values()), axis=0)[along]
+    front = [leg.name for leg in file.legs if leg.end == "front"]
+    if len({bool(hips[name][along] > middle) for name in front}) == 2:
+        raise RobotError(
+            f"legs {' and '.join(front)} are said to be front, but they stand at different ends of "
+            "the trunk; correct end of one of them, and of a hind leg"
+        )
 
 
 def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:

@@ -1,13 +1,13 @@
 """The TOML file that describes a robot to `mjx_balance`, read and checked."""
 
 import dataclasses
-import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mjx_balance.errors import InputError
+from mjx_balance.robots.record import MOST
 
 
 class RobotError(InputError):
@@ -35,6 +35,8 @@ class LegFile:
     """"left" or "right"; none: as it is placed."""
     end: str | None = None
     """"front" or "hind"; none: as it is placed."""
+    knee: str | None = None
+    """Where it points, "forward" or "backward"; none: as its limits suggest."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +103,9 @@ def parse_robot_file(text: str, path: Path) -> RobotFile:
     """
     try:
         return _parsed(path, tomllib.loads(text))
-    except (RobotError, tomllib.TOMLDecodeError) as error:
+    except RecursionError:
+        raise RobotError(f"{path}: its values are nested too deep to be read") from None
+    except ValueError as error:
         raise RobotError(f"{path}: {error}") from error
 
 
@@ -109,8 +113,11 @@ def _parsed(path: Path, values: dict[str, Any]) -> RobotFile:
     known = {f.name for f in dataclasses.fields(RobotFile)} - {"name", "folder"}
     _refuse_unknown("the file", values, known)
     for name in ("model", "trunk"):
-        if not isinstance(values.get(name), str):
+        if not _is_name(values.get(name)):
             raise RobotError(f"{name} is {values.get(name)!r}; it must be a name")
+    for name in ("source", "license"):
+        if not isinstance(values.get(name, ""), str):
+            raise RobotError(f"{name} is {values[name]!r}; it must be a text")
     legs = values.get("legs")
     if not isinstance(legs, dict) or len(legs) != 4:
         count = len(legs) if isinstance(legs, dict) else 0
@@ -119,13 +126,17 @@ def _parsed(path: Path, values: dict[str, Any]) -> RobotFile:
     used: dict[str, str] = {}
     for leg in parsed:
         for joint in leg.joints:
+            if used.get(joint) == leg.name:
+                raise RobotError(f"joint {joint!r} is in leg {leg.name} twice")
             if joint in used:
                 raise RobotError(f"joint {joint!r} is in leg {used[joint]} and in leg {leg.name}")
             used[joint] = leg.name
     for name in NUMBERS:
         value = values.get(name, 1.0)
         if not _is_number(value) or value <= 0:
-            raise RobotError(f"{name} is {value!r}; it must be a number above 0")
+            raise RobotError(
+                f"{name} is {_shown(value)}; it must be a number above 0, at most {MOST:g}"
+            )
         if name in values:
             values[name] = float(value)
     imu = values.get("imu")
@@ -134,7 +145,7 @@ def _parsed(path: Path, values: dict[str, Any]) -> RobotFile:
     elif imu is not None and not isinstance(imu, str):
         raise RobotError(f"imu is {imu!r}; it must be a site, or a place [x, y, z] in m")
     strip = values.get("strip", [])
-    if not isinstance(strip, list) or not all(isinstance(x, str) and x for x in strip):
+    if not isinstance(strip, list) or not all(map(_is_name, strip)):
         raise RobotError(f"strip is {strip!r}; it must list bodies and joints")
     values |= {"legs": parsed, "strip": tuple(strip)}
     return RobotFile(name=path.stem, folder=path.absolute().parent, **values)
@@ -146,30 +157,28 @@ def _leg(name: str, values: Any) -> LegFile:
     known = {f.name for f in dataclasses.fields(LegFile)} - {"name"}
     _refuse_unknown(f"leg {name}", values, known)
     joints = values.get("joints")
-    if not (
-        isinstance(joints, list) and len(joints) == 3 and all(isinstance(x, str) for x in joints)
-    ):
+    if not (isinstance(joints, list) and len(joints) == 3 and all(map(_is_name, joints))):
         raise RobotError(
             f"joints of leg {name} is {joints!r}; it must name three: abduction, hip, knee"
         )
     foot = values.get("foot")
-    if isinstance(foot, str):
+    if isinstance(foot, str) and foot:
         where = Foot(foot)
-    elif isinstance(foot, dict) and set(foot) == {"body", "offset"}:
-        where = Foot(str(foot["body"]), _triple(f"foot of leg {name}", foot["offset"]))
+    elif isinstance(foot, dict) and set(foot) == {"body", "offset"} and _is_name(foot["body"]):
+        where = Foot(foot["body"], _triple(f"foot of leg {name}", foot["offset"]))
     else:
         raise RobotError(
             f"foot of leg {name} is {foot!r}; it must be a geom, site or body, or "
             "{ body = ..., offset = [x, y, z] }"
         )
-    for key, options in (("side", ("left", "right")), ("end", ("front", "hind"))):
+    said = {"side": ("left", "right"), "end": ("front", "hind"), "knee": ("forward", "backward")}
+    for key, options in said.items():
         if values.get(key, options[0]) not in options:
             raise RobotError(
                 f"{key} of leg {name} is {values[key]!r}; it must be {' or '.join(options)}"
             )
-    return LegFile(
-        name, (joints[0], joints[1], joints[2]), where, values.get("side"), values.get("end")
-    )
+    words = {key: values.get(key) for key in said}
+    return LegFile(name, (joints[0], joints[1], joints[2]), where, **words)
 
 
 def _refuse_unknown(what: str, values: Mapping[str, Any], known: set[str]) -> None:
@@ -182,11 +191,21 @@ def _refuse_unknown(what: str, values: Mapping[str, Any], known: set[str]) -> No
 
 def _triple(name: str, value: Any) -> tuple[float, float, float]:
     if not isinstance(value, list) or len(value) != 3 or not all(map(_is_number, value)):
-        raise RobotError(f"{name} is at {value!r}; a place is three numbers, [x, y, z] in m")
+        raise RobotError(f"{name} is at {_shown(value)}; a place is three numbers, [x, y, z] in m")
     x, y, z = map(float, value)
     return x, y, z
 
 
 def _is_number(value: Any) -> bool:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and math.isfinite(value)
+    return number and abs(value) <= MOST
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and bool(value)
+
+
+def _shown(value: Any) -> str:
+    """Its beginning, should it be long."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:60] + "..."

@@ -1,13 +1,21 @@
 """A robot's numbers, found on its compiled model; what depends on its size follows from them."""
 
 import dataclasses
+import json
 import math
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from mjx_balance.robots.file import LegFile, RobotError, RobotFile
-from mjx_balance.robots.record import OUR_LEVER, OUR_MASS, Leg, Robot
+from mjx_balance.robots.record import (
+    OUR_LEVER,
+    OUR_MASS,
+    Leg,
+    Robot,
+    robot_from_dict,
+)
 
 LEVEL = math.cos(math.radians(1.0))
 """Cosine of what an axis may be off the one that the kinematics take it for."""
@@ -18,6 +26,8 @@ OUR_STIFFNESS, OUR_DAMPING, OUR_ARMATURE = 400.0, 16.0, 0.02
 OUR_ACTION = 0.003  # paper Eq. 3
 STRETCH = 0.77
 """Of the legs' length that they stand at: 0.35 m for ours (paper 3.1)."""
+SMALLEST = 0.01
+"""Mass and size against ours that the board can still be made for."""
 INCLINE = 7.0
 """On both axes at once, deg, that the legs must be able to follow (paper 3.1)."""
 
@@ -34,8 +44,9 @@ def measured(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: fl
     Raises:
       RobotError: if a leg is none that can be put on the board, or they are too short for it.
     """
-    legs = tuple(_leg(file, model, leg, foot) for leg, foot in zip(file.legs, feet, strict=True))
+    legs = _placed([_leg(file, model, *one) for one in zip(file.legs, feet, strict=True)])
     _check_corners(file, legs)
+    _check_bends(file, legs)
     trunk = model.body(file.trunk)
     mass = _clean(trunk.subtreemass[0])
     hips = [joint for leg in legs for joint in leg.joints[:2]]
@@ -58,6 +69,12 @@ def measured(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: fl
         body_height=0.0,
         action_max=0.0,
     )
+    if min(robot.mass_scale, robot.size_scale) < SMALLEST:
+        raise RobotError(
+            f"it weighs {mass:.3g} kg and its feet are {robot.lever:.3g} m off its middle; at "
+            f"least {SMALLEST * OUR_MASS:.2g} kg and {SMALLEST * OUR_LEVER:.2g} m are needed for "
+            "a board of its size"
+        )
     sized = {"body_height": file.body_height or _body_height(robot)}
     sized["action_max"] = _digits(OUR_ACTION * robot.lever / OUR_LEVER)
     stiffer = _stiffer(robot, sized["body_height"])
@@ -65,7 +82,12 @@ def measured(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: fl
     sized["servo_damping"] = _digits(OUR_DAMPING * stiffer)
     sized["servo_armature"] = _digits(OUR_ARMATURE * stiffer)
     said = {name: getattr(file, name) or value for name, value in sized.items()}
-    return dataclasses.replace(robot, **said)
+    robot = dataclasses.replace(robot, **said)
+    try:  # a policy carries it; better refused now than when a training has ended
+        robot_from_dict(json.loads(json.dumps(dataclasses.asdict(robot))))
+    except ValueError as error:
+        raise RobotError(str(error)) from error
+    return robot
 
 
 def check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
@@ -82,6 +104,11 @@ def check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
             if model.joint(joint).type[0] != mujoco.mjtJoint.mjJNT_HINGE:
                 raise RobotError(f"joint {joint!r} of leg {name} is no hinge")
             body = int(model.jnt_bodyid[model.joint(joint).id])
+            if above == body:
+                raise RobotError(
+                    f"joint {joint!r} of leg {name} is on body {model.body(body).name!r}, as the "
+                    "one before it; each joint of a leg needs a body of its own"
+                )
             if above not in ancestors(model, body):
                 raise RobotError(
                     f"joint {joint!r} of leg {name} does not hang on {model.body(above).name!r}; "
@@ -201,10 +228,13 @@ def _leg(file: RobotFile, model: mujoco.MjModel, said: LegFile, foot: str) -> Le
     thigh, shank = knee - hip, end - knee
     leaning = [math.atan2(-v[0], -v[2]) for v in (thigh, shank)]
     zeros = (_clean(tilt), _clean(leaning[0]), _clean(_wrapped(leaning[1] - leaning[0])))
+    ranges = [_turns(model, *one) for one in zip(joints, signs, zeros, strict=True)]
+    abducts = _levelled(name, joints[0], ranges[0])
+    bend = _bend(said, ranges[1], ranges[2], [math.hypot(v[0], v[2]) for v in (thigh, shank)])
     return Leg(
         name=name,
-        left=bool(end[1] > 0),
-        front=bool(hip[0] > 0),
+        left=False,  # `_placed` sees
+        front=False,
         joints=joints,
         foot=foot,
         x=_clean(hip[0]),
@@ -215,46 +245,128 @@ def _leg(file: RobotFile, model: mujoco.MjModel, said: LegFile, foot: str) -> Le
         thigh=_clean(math.hypot(thigh[0], thigh[2])),
         calf=_clean(math.hypot(shank[0], shank[2])),
         signs=(signs[0], signs[1], signs[2]),
-        zeros=zeros,
-        knee=_knee_range(model, joints, signs, zeros, thigh, shank),
+        zeros=(
+            _clean(zeros[0] + abducts),
+            _clean(zeros[1] + bend.hip),
+            _clean(zeros[2] + bend.calf),
+        ),
+        knee=(_clean(bend.low), _clean(bend.high)),
     )
 
 
-FREE_KNEE = (-2.7, -0.1)
-"""Turns of a knee without limits, rad: backward, short of straight and of the thigh."""
+def _placed(legs: list[Leg]) -> tuple[Leg, ...]:
+    """With their corners: a trunk's origin need not lie between its legs."""
+    x, y = (np.mean([getattr(leg, axis) for leg in legs]) for axis in "xy")
+    return tuple(
+        dataclasses.replace(leg, left=bool(leg.y > y), front=bool(leg.x > x)) for leg in legs
+    )
 
 
-def _knee_range(
-    model: mujoco.MjModel,
-    joints: tuple[str, str, str],
-    signs: list[float],
-    zeros: tuple[float, float, float],
-    thigh: np.ndarray,
-    shank: np.ndarray,
-) -> tuple[float, float]:
-    """Turns of the knee within its limits and the hip's, on the side that has more of them."""
-    a, b = (math.hypot(v[0], v[2]) for v in (thigh, shank))
-    limits = []
-    for joint, sign, zero in zip(joints[1:], signs[1:], zeros[1:], strict=True):
-        one = model.joint(joint)
-        free = not model.jnt_limited[one.id]
-        ends = (-math.inf, math.inf) if free else sorted(sign * one.range + zero)
-        limits.append(ends)
-    (hip_low, hip_high), (low, high) = limits
-    if math.isinf(low):
-        low, high = FREE_KNEE
-    elif -low > high:
-        high = min(high, FREE_KNEE[1]) if high > 0 else high
+FREE_KNEE = (0.1, 2.7)
+"""Turns of a knee that nothing stops, rad: short of straight, and of the thigh."""
+WHOLE_TURNS = [2 * math.pi * k for k in (0, 1, -1, 2, -2)]
+"""By which a joint's angles may be drawn off, rad."""
+
+
+def _turns(model: mujoco.MjModel, joint: str, sign: float, zero: float) -> tuple[float, float]:
+    """What its limits let a joint turn the leg by, rad; infinite without limits."""
+    one = model.joint(joint)
+    if not model.jnt_limited[one.id]:
+        return -math.inf, math.inf
+    low, high = sorted(sign * one.range + zero)
+    return float(low), float(high)
+
+
+def _levelled(leg: str, joint: str, turns: tuple[float, float]) -> float:
+    """Whole turns that bring the level hip's axis within an abduction's limits, rad."""
+    low, high = turns
+    for whole in WHOLE_TURNS:
+        if low + whole - SLACK <= 0 <= high + whole + SLACK:
+            return whole
+    raise RobotError(
+        f"joint {joint!r} of leg {leg} turns the hip's axis from {math.degrees(low):.0f} to "
+        f"{math.degrees(high):.0f} deg off level; it must be able to hold it level"
+    )
+
+
+SLACK = 1e-3
+"""Of a limit that is level itself, rad."""
+
+
+class _Bend(NamedTuple):
+    """A knee that points one way."""
+
+    low: float
+    """Least turn of the calf against the thigh, rad; negative: backward."""
+    high: float
+    """The greatest."""
+    hip: float
+    """Whole turns to add to the hip's angle for the thigh's turn, rad."""
+    calf: float
+    """Likewise to the knee's."""
+
+
+def _bend(
+    said: LegFile, hip: tuple[float, float], knee: tuple[float, float], lengths: list[float]
+) -> _Bend:
+    """Which way the knee points, and how far it turns within its limits and the hip's.
+
+    Backward, unless forward has more than twice the room: limits that hardly differ say nothing,
+    and all legs should bend alike.
+
+    Args:
+      said: may say it.
+      hip: least and greatest turn of the thigh, rad.
+      knee: of the calf against it, rad.
+      lengths: of thigh and calf, m.
+    """
+    ways = {
+        name: _bent(side, hip, knee, lengths) for name, side in (("backward", -1), ("forward", 1))
+    }
+    backward, forward = ways["backward"], ways["forward"]
+    if said.knee is not None:
+        chosen = ways[said.knee]
+    elif backward and forward:
+        wide = forward.high - forward.low > 2 * (backward.high - backward.low)
+        chosen = forward if wide else backward
     else:
-        low = max(low, -FREE_KNEE[1]) if low < 0 else low
+        chosen = backward or forward
+    if chosen is None:
+        way = f" with the knee {said.knee}" if said.knee else ""
+        raise RobotError(
+            f"joints {said.joints[1]!r} and {said.joints[2]!r} of leg {said.name} cannot turn far "
+            f"enough to keep its foot under the hip{way}: the thigh turns {_degrees(hip)}, the "
+            f"calf against it {_degrees(knee)}"
+        )
+    return chosen
+
+
+def _bent(
+    side: int, hip: tuple[float, float], knee: tuple[float, float], lengths: list[float]
+) -> _Bend | None:
+    """The knee on one side, -1 backward or 1 forward; none: its limits, or the hip's, forbid it."""
+    ends = (-math.pi, 0.0) if side < 0 else (0.0, math.pi)
+
+    def room(whole: float) -> float:
+        return min(knee[1] + whole, ends[1]) - max(knee[0] + whole, ends[0])
+
+    calf = max(WHOLE_TURNS, key=room)
+    free = sorted(side * x for x in FREE_KNEE)
+    low, high = knee[0] + calf, knee[1] + calf
+    low = low if low > ends[0] else free[0]
+    high = high if high < ends[1] else free[1]
+    if low >= high:
+        return None
+    a, b = lengths
     turns = np.linspace(low, high, 2001)
     leans = -np.arctan2(b * np.sin(turns), a + b * np.cos(turns))
-    good = turns[(leans >= hip_low) & (leans <= hip_high)]
-    if not len(good):
-        raise RobotError(
-            f"joint {joints[1]!r} cannot turn far enough to keep its foot under the hip"
-        )
-    return _clean(good[0]), _clean(good[-1])
+
+    def good(whole: float) -> np.ndarray:
+        return turns[(leans >= hip[0] + whole) & (leans <= hip[1] + whole)]
+
+    thigh = max(WHOLE_TURNS, key=lambda whole: len(good(whole)))
+    kept = good(thigh)
+    return _Bend(float(kept[0]), float(kept[-1]), thigh, calf) if len(kept) else None
 
 
 def _clean(value: float) -> float:
@@ -265,6 +377,11 @@ def _clean(value: float) -> float:
 def _wrapped(angle: float) -> float:
     """To -pi .. pi."""
     return math.remainder(angle, 2 * math.pi)
+
+
+def _degrees(turns: tuple[float, float]) -> str:
+    low, high = (math.degrees(x) for x in turns)
+    return "freely" if math.isinf(low) else f"from {low:.0f} to {high:.0f} deg"
 
 
 def _vector(v: np.ndarray) -> str:
@@ -290,6 +407,21 @@ def _check_corners(file: RobotFile, legs: tuple[Leg, ...]) -> None:
         corners[corner] = leg.name
 
 
+def _check_bends(file: RobotFile, legs: tuple[Leg, ...]) -> None:
+    """Left and right legs are mirror images, or the file says that they are not."""
+    said = {leg.name: leg.knee for leg in file.legs}
+    for leg in legs:
+        for other in legs:
+            mirrored = leg.front == other.front and leg.left and not other.left
+            differ = sum(leg.knee) * sum(other.knee) < 0
+            if mirrored and differ and None in (said[leg.name], said[other.name]):
+                way = "forward" if sum(leg.knee) > 0 else "backward"
+                raise RobotError(
+                    f"knees of legs {leg.name} and {other.name} would point different ways, that "
+                    f"of {leg.name} {way}; say knee of both"
+                )
+
+
 UNLIMITED = 1e4
 """Torque of servos that neither file nor model limit, N m."""
 
@@ -301,7 +433,8 @@ def _torque(model: mujoco.MjModel, joint: str) -> float:
     if model.jnt_actfrclimited[number]:
         limits.append(np.abs(model.jnt_actfrcrange[number]).max())
     for k in range(model.nu):
-        moves = model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT
+        kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        moves = mujoco.mjtTrn(int(model.actuator_trntype[k])) in kinds
         if not moves or model.actuator_trnid[k, 0] != number:
             continue
         gear = abs(model.actuator_gear[k, 0])
@@ -312,6 +445,6 @@ def _torque(model: mujoco.MjModel, joint: str) -> float:
             and model.actuator_biastype[k] == mujoco.mjtBias.mjBIAS_NONE
         )
         if motor and model.actuator_ctrllimited[k]:
-            gain = model.actuator_gainprm[k, 0]
+            gain = abs(model.actuator_gainprm[k, 0])
             limits.append(gear * gain * np.abs(model.actuator_ctrlrange[k]).max())
     return float(min(limits, default=UNLIMITED))

@@ -127,8 +127,8 @@ class Robot:
 
     @property
     def lever(self) -> float:
-        """The longer of the two, m: what a height change turns the body by."""
-        return max(self.half_length, self.half_track)
+        """Half of what the feet span, along or across, m: a height change turns the body by it."""
+        return max(float(np.ptp(self.each(axis))) / 2 for axis in "xy")
 
     @property
     def height_range(self) -> tuple[float, float]:
@@ -144,8 +144,8 @@ class Robot:
 
     @property
     def size_scale(self) -> float:
-        """Lever against our own robot's, to three decimals."""
-        return round(self.lever / OUR_LEVER, 3)
+        """Its furthest foot's distance, along or across, against our own's, to three decimals."""
+        return round(max(self.half_length, self.half_track) / OUR_LEVER, 3)
 
     def each(self, name: str) -> np.ndarray:
         """One number of every leg, (legs, ...)."""
@@ -165,7 +165,7 @@ def robot_from_dict(values: Any) -> Robot:
     return _record(Robot, {**values, "legs": built})
 
 
-MOST = 1e4
+MOST = 1e7
 """Of any number of a robot, in its unit: what is greater has never walked."""
 
 
@@ -188,5 +188,6 @@ def _value(name: str, hint: Any, value: Any) -> Any:
     else:
         good = bool(parts) or type(value) is kind
     if not good:
-        raise ValueError(f"{name} must be {'a sane number' if hint is float else hint.__name__}")
+        wanted = f"a sane number, within {MOST:g}" if hint is float else hint.__name__
+        raise ValueError(f"{name} must be {wanted}, not {value!s:.40}")
     return value

@@ -1,6 +1,7 @@
 """A maker's model becomes the same robot however it is drawn, and the one it is."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,14 @@ import pytest
 from mjx_balance.config import Config, ConfigError, check, fitted, preset
 from mjx_balance.controllers import make_controller, measure_response
 from mjx_balance.evaluation import run_suite
-from mjx_balance.robots import Robot, RobotError, find_robot, robot_spec, shipped
+from mjx_balance.robots import (
+    Robot,
+    RobotError,
+    find_robot,
+    robot_from_dict,
+    robot_spec,
+    shipped,
+)
 from mjx_balance.robots.building import scene_dir
 from mjx_balance.robots.draft import draft
 from mjx_balance.scene import ROBOT, Scene, load_scene
@@ -490,6 +498,96 @@ def test_masses_are_what_the_compiler_makes_them(
     assert model.body(f"{ROBOT}trunk").subtreemass[0] == pytest.approx(total)
 
 
+KNEES = {
+    "none to speak of": ("-9.42 9.42", (-2.7, -0.1)),
+    "alike both ways": ("-2.6 2.69", (-2.6, -0.1)),
+    "past the thigh": ("-3.5 -0.8", (-2.7, -0.8)),
+    "mostly forward": ("-1 2.69", (0.1, 2.69)),
+    "a whole turn off": ("-5.585 -3.578", (2 * np.pi - 5.585, 2 * np.pi - 3.578)),
+    "two turns off": ("9.866 11.766", (9.866 - 4 * np.pi, 11.766 - 4 * np.pi)),
+}
+
+
+@pytest.mark.parametrize("limits", KNEES)
+def test_which_way_knees_point(limits: str, tmp_path: Path) -> None:
+    """By their limits; the servos' targets lie within these, and put the feet where told."""
+    said, turns = KNEES[limits]
+    name = edited(tmp_path, [('range="-2.72 -0.838"', f'range="{said}"')])
+    _check_knees(name, [turns] * 4)
+
+
+def test_a_hip_a_whole_turn_off(tmp_path: Path) -> None:
+    name = edited(tmp_path, [('range="-1.5708 3.4907"', 'range="4.7124 9.7739"')])
+    _check_knees(name, [(-2.72, -0.838)] * 4)
+
+
+def test_knees_that_can_do_both_all_point_backward(tmp_path: Path) -> None:
+    """Those of the right turn the other way, so that they have more room forward."""
+    flips = [(f'name="R{x}_knee" class', f'name="R{x}_knee" axis="0 -1 0" class') for x in "FH"]
+    name = edited(tmp_path, [('range="-2.72 -0.838"', 'range="-2.69 2.6"'), *flips])
+    _check_knees(name, [(-2.69, -0.1), (-2.6, -0.1)] * 2)
+
+
+def test_a_file_may_say_which_way_knees_point(tmp_path: Path) -> None:
+    """And front knees may point another way than hind ones."""
+    forward = dict.fromkeys(("LF", "RF"), 'knee = "forward"')
+    name = edited(tmp_path, [('range="-2.72 -0.838"', 'range="-2.6 2.6"')], **forward)
+    _check_knees(name, [(0.1, 2.6), (0.1, 2.6), (-2.6, -0.1), (-2.6, -0.1)])
+
+
+def _check_knees(name: str, turns: list[tuple[float, float]]) -> None:
+    scene = scene_of(name)
+    model, robot = scene.model, scene.robot
+    np.testing.assert_allclose([leg.knee for leg in robot.legs], turns, atol=2e-3)
+    data = mujoco.MjData(model)
+    for height in np.linspace(*robot.height_range, 5):
+        angles = joint_angles(robot, np.full(4, height))
+        feet = feet_of(scene, data, angles)
+        np.testing.assert_allclose(-feet[:, 2] + robot.foot_radius, height, atol=1e-6)
+        np.testing.assert_allclose(foot_heights(robot, angles), height, atol=1e-6)
+        for leg, row in zip(robot.legs, angles, strict=True):
+            for joint, angle in zip(leg.joints, row, strict=True):
+                low, high = model.joint(f"{ROBOT}{joint}").range
+                assert low - 1e-6 <= angle <= high + 1e-6, joint
+
+
+def test_a_trunk_whose_origin_is_behind_all_legs(tmp_path: Path, robot: Robot) -> None:
+    """Corners are told apart, and an action turns the body by as much as ours."""
+    edits = [(f'"{leg}_hip" pos="{x}', f'"{leg}_hip" pos="{y}') for leg, x, y in SHIFTED]
+    found = find_robot(edited(tmp_path, edits))
+    assert (found.left, found.front) == (robot.left, robot.front)
+    assert found.lever == pytest.approx(0.193)
+    assert found.action_max == 0.003
+    assert [leg.x for leg in found.legs] == pytest.approx([0.396, 0.396, 0.01, 0.01])
+
+
+SHIFTED = [
+    (leg, f"{x}0.193", f"{0.203 + float(x + '0.193'):.3f}")
+    for leg, x in (("LF", ""), ("RF", ""), ("LH", "-"), ("RH", "-"))
+]
+
+
+@pytest.mark.parametrize("kind", ["negative gain", "in the parent's frame"])
+def test_torques_of_unusual_motors(kind: str, tmp_path: Path) -> None:
+    spec = bodies.with_motors(bodies.our_spec())
+    for motor in spec.actuators:
+        if kind == "negative gain":
+            motor.gainprm[0], motor.ctrlrange = -2, motor.ctrlrange / 2
+        else:
+            motor.trntype = mujoco.mjtTrn.mjTRN_JOINTINPARENT
+    text = bodies.file_text(Path("model.xml"), foot_radius="0.022")
+    robot = find_robot(written(tmp_path, spec, text))
+    assert (robot.hip_torque, robot.knee_torque) == pytest.approx((23.7, 45.4), rel=1e-5)
+
+
+def test_a_strong_robot_can_be_read_back(tmp_path: Path) -> None:
+    """A policy carries its numbers; one of 300 kg on narrow legs has servos of 10,100 N m/rad."""
+    name = edited(tmp_path, [], servo_stiffness="10100", knee_torque="20000")
+    robot = find_robot(name)
+    values = json.loads(json.dumps(dataclasses.asdict(robot)))
+    assert robot_from_dict(values) == robot
+
+
 def heavy_spec() -> mujoco.MjSpec:
     spec = bodies.our_spec()
     spec.body("trunk").mass = 400
@@ -506,6 +604,15 @@ def short_spec() -> mujoco.MjSpec:
 def tied_spec() -> mujoco.MjSpec:
     spec = bodies.our_spec()
     spec.delete(spec.joint("root"))
+    return spec
+
+
+def universal_spec() -> mujoco.MjSpec:
+    """One leg's abduction and hip on one body."""
+    spec = bodies.our_spec()
+    spec.delete(spec.joint("LF_hip"))
+    hip = spec.body("LF_hip").add_joint(name="LF_hip", axis=[0, 1, 0])
+    hip.type = mujoco.mjtJoint.mjJNT_HINGE
     return spec
 
 
@@ -560,6 +667,43 @@ def swapped(old: str, new: str) -> Callable[[str], str]:
                 ("LF_knee", "strip takes joint 'LF_knee' of leg LF, which the leg needs"),
                 ("LF_thigh", "strip takes joint 'LF_hip' of leg LF, which the leg needs"),
             )
+        ),
+        *(
+            (bodies.our_spec, swapped("model.xml", f"{package}:m.xml"), f"'{package}' is not inst")
+            for package in ("no_such.part", "./here", "__main__", "my robot")
+        ),
+        (bodies.our_spec, swapped('trunk = "trunk"', 'trunk = "world"'), "trunk is 'world', which"),
+        (
+            bodies.our_spec,
+            lambda text: text + 'knee = "forward"\n',
+            "joints 'RH_hip' and 'RH_knee' of leg RH cannot turn far enough .* the knee forward: "
+            "the thigh turns from -90 to 200 deg, the calf against it from -156 to -48 deg",
+        ),
+        (
+            lambda: _range("LH_knee", [0.8, 2.7]),
+            str,
+            "knees of legs LH and RH would point different ways, that of LH forward; say knee of b",
+        ),
+        (
+            lambda: _range("RF_abduction", [0.1, 1.0]),
+            str,
+            "joint 'RF_abduction' of leg RF turns the hip's axis from 6 to 57 deg off level",
+        ),
+        (
+            universal_spec,
+            str,
+            "joint 'LF_hip' of leg LF is on body 'LF_hip', as the one before it",
+        ),
+        (
+            bodies.our_spec,
+            lambda text: _ends(text, {"LF": "front", "RF": "hind", "LH": "front", "RH": "hind"}),
+            "legs LF and LH are said to be front, but they stand at different ends",
+        ),
+        (lambda: _weighing(1e-4), str, "it weighs 0.00152 kg"),
+        (
+            lambda: _weighing(1e5),
+            str,
+            r"servo_stiffness must be a sane number, within 1e\+07, not 4\d{7}.0",
         ),
         (short_spec, str, "too short for the board: its legs reach from 0.3"),
         (
@@ -624,6 +768,52 @@ def test_mujocos_words_name_the_element(tmp_path: Path, old: str, new: str, mess
     with pytest.raises(RobotError, match="Element") as caught:
         draft("model.xml", tmp_path / "model.xml")
     assert "\n" not in str(caught.value)
+
+
+def _range(joint: str, limits: list[float]) -> mujoco.MjSpec:
+    spec = bodies.our_spec()
+    spec.joint(joint).range = limits
+    return spec
+
+
+def _weighing(share: float) -> mujoco.MjSpec:
+    """Its own weight times this."""
+    spec = bodies.our_spec()
+    for body in spec.bodies[1:]:
+        body.mass, body.inertia = body.mass * share, body.inertia * share
+    return spec
+
+
+def _ends(text: str, ends: dict[str, str]) -> str:
+    for leg, end in ends.items():
+        text = swapped(f'"{leg}_foot"', f'"{leg}_foot"\nend = "{end}"')(text)
+    return text
+
+
+def _headed() -> mujoco.MjSpec:
+    """The trunk's weight half a metre ahead: 6.92 of 15.2 kg, the legs' own 1 mm behind."""
+    spec = bodies.our_spec()
+    spec.body("trunk").ipos = [0.5, 0, 0]
+    return spec
+
+
+@pytest.mark.parametrize(
+    ("spec", "said", "message"),
+    [
+        (_headed, {}, "its centre of mass is 22[678] mm ahead of .* stand from -193 to 193 mm"),
+        (
+            bodies.our_spec,
+            {"servo_stiffness": "30", "knee_torque": "500", "hip_torque": "500"},
+            "with servo_stiffness 30 N m/rad: leave out servo_stiffness of its file",
+        ),
+    ],
+)
+def test_why_it_does_not_stand(
+    spec: Callable[[], mujoco.MjSpec], said: dict[str, str], message: str, tmp_path: Path
+) -> None:
+    text = bodies.file_text(Path("model.xml"), **{"knee_torque": "500", "hip_torque": "500"} | said)
+    with pytest.raises(ConfigError, match=message):
+        scene_of(written(tmp_path, spec(), text))
 
 
 def test_too_heavy_for_its_servos(tmp_path: Path) -> None:

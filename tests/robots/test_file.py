@@ -72,6 +72,27 @@ def test_everything_is_read(tmp_path: Path) -> None:
         ("= 30", "= 0", "knee_torque is 0; it must be a number above 0"),
         ("= 30", '= "30"', "knee_torque is '30'; it must be a number above 0"),
         ("= 30", "= inf", "knee_torque is inf"),
+        (
+            "= 30",
+            "= 1" + 400 * "0",
+            r"knee_torque is 10+\.\.\.; it must be a number above 0, at mo",
+        ),
+        ("= 30", "= 1" + 5000 * "0", "Exceeds the limit"),
+        ("= 30", "= " + 3000 * "[", "nested too deep"),
+        ('"here"', '["here"]', r"source is \['here'\]; it must be a text"),
+        ('"torso"', '""', "trunk is ''; it must be a name"),
+        ('"a0", "a1"', '"a0", ""', r"joints of leg A is \['a0', '', 'a2'\]; it must name three"),
+        ('"a0", "a1"', '"a0", "a0"', "joint 'a0' is in leg A twice"),
+        (
+            'body = "b"',
+            "body = 3",
+            "foot of leg B is {'body': 3.*; it must be a geom, site or body",
+        ),
+        (
+            'end = "hind"',
+            'knee = "back"',
+            "knee of leg A is 'back'; it must be forward or backward",
+        ),
         ("[legs.D]", "[legs.A.more]", "legs has 3 entries; it must have four"),
         ('model = "rex.xml"', "model =", "Invalid value"),
     ],
@@ -81,6 +102,11 @@ def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, message: str
     with pytest.raises(RobotError, match=message) as caught:
         read(tmp_path, TEXT.replace(old, new, 1))
     assert str(tmp_path / "rex.toml") in str(caught.value)
+
+
+def test_which_way_a_knee_points_is_read(tmp_path: Path) -> None:
+    got = read(tmp_path, TEXT.replace('end = "hind"', 'knee = "forward"'))
+    assert [leg.knee for leg in got.legs] == ["forward", None, None, None]
 
 
 def test_no_file_and_no_text(tmp_path: Path) -> None:
