@@ -1,14 +1,16 @@
 """A first TOML file for a robot, from its model alone: legs are found by their structure."""
 
 import itertools
+import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from mjx_balance.robots.building import read_model, words
-from mjx_balance.robots.file import RobotError
+from mjx_balance.robots.building import ALIKE, read_model, words
+from mjx_balance.robots.file import RobotError, parse_robot_file
 from mjx_balance.robots.measuring import ancestors
 
 HEADER = """\
@@ -17,6 +19,9 @@ HEADER = """\
 """
 USUAL_RADIUS = 0.02
 """Of a foot that is no sphere, m."""
+REACHES = 0.85
+"""Share of its calf's length from which a sphere or a site is the foot, and no ornament."""
+CORNERS = {"FL": "front left", "FR": "front right", "RL": "rear left", "RR": "rear right"}
 
 
 class _Chain(NamedTuple):
@@ -34,8 +39,10 @@ class _Foot(NamedTuple):
     """As the file says it."""
     place: np.ndarray
     """(3,) in the world, m."""
-    radius: float | None
-    """m; none: the file need not say it."""
+    radius: float
+    """m"""
+    sphere: bool = False
+    """Whether the geom that the file names says how large it is."""
 
 
 def draft(model: str, path: Path) -> str:
@@ -46,7 +53,8 @@ def draft(model: str, path: Path) -> str:
       path: where the model is.
 
     Raises:
-      RobotError: if it cannot be read, or has no free trunk, or not four legs.
+      RobotError: if it cannot be read, has no free trunk or not a leg at each corner, or a joint
+        without a name.
     """
     spec = read_model(path)
     try:
@@ -64,7 +72,9 @@ def draft(model: str, path: Path) -> str:
             f"{path} has {len(legs)} chains of three hinges below its trunk ({names}); a robot of "
             "this kind has four legs"
         )
-    return _written(compiled, data, model, trunk, legs)
+    text = _written(compiled, data, model, trunk, legs)
+    parse_robot_file(text, path)
+    return text
 
 
 def _trunk(model: mujoco.MjModel, path: Path) -> int:
@@ -95,29 +105,34 @@ def _chains(model: mujoco.MjModel, trunk: int) -> list[_Chain]:
 
 
 def _foot(model: mujoco.MjModel, data: mujoco.MjData, chain: _Chain) -> _Foot:
-    """The sphere, or else the site, or else the point of a geom, that is furthest from the knee."""
+    """The sphere, or else the site, or else the point of a geom, that is furthest from the knee.
+
+    A sphere or site that the calf clearly reaches beyond is no foot.
+    """
     knee = data.xanchor[chain.joints[2]]
 
     def distance(place: np.ndarray) -> float:
         return float(np.linalg.norm(place - knee))
 
     geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in chain.calf]
+    corners = [p for g in geoms for p in _corners(model, data, g)]
+    furthest = max(corners or [data.xpos[chain.calf[-1]]], key=distance)
+    enough = REACHES * distance(furthest)
     spheres = [g for g in geoms if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_SPHERE]
+    spheres = [g for g in spheres if distance(data.geom_xpos[g]) >= enough]
     if spheres:
         one = max(spheres, key=lambda g: distance(data.geom_xpos[g]))
         radius, place = float(model.geom_size[one, 0]), data.geom_xpos[one]
         if model.geom(one).name:
-            return _Foot(f'"{model.geom(one).name}"', place, None)
+            return _Foot(json.dumps(model.geom(one).name, ensure_ascii=False), place, radius, True)
         return _Foot(_offset(model, data, int(model.geom_bodyid[one]), place), place, radius)
     sites = [s for s in range(model.nsite) if model.site_bodyid[s] in chain.calf]
-    named = [s for s in sites if model.site(s).name]
-    if named:
-        one = max(named, key=lambda s: distance(data.site_xpos[s]))
-        return _Foot(f'"{model.site(one).name}"', data.site_xpos[one], USUAL_RADIUS)
-    corners = [p for g in geoms for p in _corners(model, data, g)]
-    corners = corners or [data.xpos[chain.calf[-1]]]
-    place = max(corners, key=distance)
-    place = place - USUAL_RADIUS * (place - knee) / max(distance(place), USUAL_RADIUS)
+    sites = [s for s in sites if model.site(s).name and distance(data.site_xpos[s]) >= enough]
+    if sites:
+        one = max(sites, key=lambda s: distance(data.site_xpos[s]))
+        name = json.dumps(model.site(one).name, ensure_ascii=False)
+        return _Foot(name, data.site_xpos[one], USUAL_RADIUS)
+    place = furthest - USUAL_RADIUS * (furthest - knee) / max(distance(furthest), USUAL_RADIUS)
     return _Foot(_offset(model, data, chain.calf[0], place), place, USUAL_RADIUS)
 
 
@@ -137,7 +152,22 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> list[np.n
 def _offset(model: mujoco.MjModel, data: mujoco.MjData, body: int, place: np.ndarray) -> str:
     at = data.xmat[body].reshape(3, 3).T @ (place - data.xpos[body])
     numbers = ", ".join(f"{x + 0.0:.4g}" for x in at)
-    return f'{{ body = "{model.body(body).name}", offset = [{numbers}] }}'
+    name = _name(model.body(body).name, f"body {body}, which holds a foot,")
+    return f"{{ body = {name}, offset = [{numbers}] }}"
+
+
+def _name(name: str, what: str) -> str:
+    """As TOML writes it."""
+    if not name:
+        raise RobotError(f"{what} has no name; give it one in its model, for the file to use")
+    return json.dumps(name, ensure_ascii=False)
+
+
+def _joints(model: mujoco.MjModel, joints: Iterable[int]) -> str:
+    """Their names, as TOML writes a list."""
+    holders = {k: model.body(int(model.jnt_bodyid[k])).name for k in joints}
+    names = [_name(model.joint(k).name, f"a joint of body {holders[k]!r}") for k in holders]
+    return f"[{', '.join(names)}]"
 
 
 def _written(
@@ -150,35 +180,36 @@ def _written(
     turn = data.xmat[trunk].reshape(3, 3).T
     hips = [turn @ (data.xanchor[chain.joints[0]] - data.xpos[trunk]) for chain, _ in legs]
     forward = int(np.argmax(np.ptp(hips, axis=0)[:2]))
-    corners = {}
-    for hip, leg in zip(hips, legs, strict=True):
+    corners: dict[str, tuple[_Chain, _Foot]] = {}
+    for hip, leg in zip(hips - np.mean(hips, axis=0), legs, strict=True):
         ahead, left = hip[forward], hip[1] if forward == 0 else -hip[0]
-        corners[("F" if ahead > 0 else "R") + ("L" if left > 0 else "R")] = leg
-    lines = [HEADER + f'model = "{name}"', f'trunk = "{model.body(trunk).name}"']
+        corner = ("F" if ahead > 0 else "R") + ("L" if left > 0 else "R")
+        if corner in corners:
+            both = _joints(model, (corners[corner][0].joints[0], leg[0].joints[0]))
+            raise RobotError(
+                f"the legs of joints {both} both stand {CORNERS[corner]}; each corner has one"
+            )
+        corners[corner] = leg
+    trunks = _name(model.body(trunk).name, "the body of the free joint, the trunk,")
+    lines = [f"{HEADER}model = {_name(name, 'the model')}", f"trunk = {trunks}"]
     if forward == 1:
         lines.append(
             '# Looks along its y, it seems; if not, say end = "front" or "hind" of all legs.'
         )
-    imus = [s for s in range(model.nsite) if model.site_bodyid[s] == trunk]
-    imus = [model.site(s).name for s in imus if "imu" in model.site(s).name.lower()]
-    lines += [f'imu = "{imu}"' for imu in imus[:1]]
+    imus = [model.site(s).name for s in range(model.nsite) if model.site_bodyid[s] == trunk]
+    lines += [f"imu = {_name(imu, 'imu')}" for imu in imus if "imu" in imu.lower()][:1]
     used = {joint for chain, _ in legs for joint in chain.joints}
-    fixed = [
-        model.joint(k).name
-        for k in range(model.njnt)
-        if k not in used and model.jnt_type[k] != mujoco.mjtJoint.mjJNT_FREE
-    ]
+    hinges = [k for k in range(model.njnt) if model.jnt_type[k] != mujoco.mjtJoint.mjJNT_FREE]
+    fixed = [k for k in hinges if k not in used]
     if fixed:
-        lines.append(f"strip = {_list(fixed)}  # fixed; a body's name instead leaves it out")
-    radii = [foot.radius for _, foot in legs if foot.radius is not None]
-    lines += [f"foot_radius = {radius:.4g}" for radius in radii[:1]]
-    for corner in ("FL", "FR", "RL", "RR"):
-        if corner in corners:
-            chain, foot = corners[corner]
-            joints = _list([model.joint(k).name for k in chain.joints])
-            lines += ["", f"[legs.{corner}]", f"joints = {joints}", f"foot = {foot.text}"]
+        lines.append(
+            f"strip = {_joints(model, fixed)}  # fixed; a body's name instead leaves it out"
+        )
+    radii = [foot.radius for _, foot in legs]
+    if max(radii) - min(radii) > ALIKE or not all(foot.sphere for _, foot in legs):
+        lines.append(f"foot_radius = {max(radii):.4g}")
+    for corner in CORNERS:
+        chain, foot = corners[corner]
+        joints = _joints(model, chain.joints)
+        lines += ["", f"[legs.{corner}]", f"joints = {joints}", f"foot = {foot.text}"]
     return "\n".join(lines) + "\n"
-
-
-def _list(names: list[str]) -> str:
-    return "[" + ", ".join(f'"{name}"' for name in names) + "]"

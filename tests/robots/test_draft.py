@@ -2,11 +2,13 @@
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
 import bodies
 import mujoco
+import numpy as np
 import pytest
 
 from mjx_balance.config import check, fitted, preset
@@ -123,6 +125,91 @@ def test_a_urdfs_trunk_is_its_root(tmp_path: Path) -> None:
     text = text.replace('trunk = "base_footprint"', 'trunk = "trunk"')
     with pytest.raises(RobotError, match="it hangs on body 'base_footprint', which has one"):
         build(parse_robot_file(text, tmp_path / "drafted.toml"))
+
+
+def ornamented() -> mujoco.MjSpec:
+    """A ball at half a calf's length and a mark at the knee; the calf's own end is a capsule's."""
+    spec = bodies.our_spec()
+    for leg in bodies.LEGS:
+        for geom in [g for g in spec.geoms if g.name in (f"{leg}_foot", f"{leg}_rubber")]:
+            spec.delete(geom)
+        spec.delete(spec.site(f"{leg}_foot"))
+        calf = spec.body(f"{leg}_calf")
+        calf.add_geom(name=f"{leg}_ball", pos=[0, 0, -0.1], size=[0.03, 0, 0])
+        calf.add_site(name=f"{leg}_mark")
+        calf.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.01, 0, 0], fromto=[0, 0, -0.1, 0, 0, -0.225]
+        )
+    return spec
+
+
+def test_ornaments_are_no_feet(tmp_path: Path) -> None:
+    text, _ = drafted(ornamented(), tmp_path)
+    assert 'foot = { body = "LF_calf", offset = [0, 0, -0.215] }' in text
+    assert "ball" not in text
+    assert "mark" not in text
+
+
+def test_feet_of_different_sizes(tmp_path: Path) -> None:
+    """The draft says how large all are, so that it can be built: as the largest."""
+    spec = bodies.our_spec()
+    for geom in [g for g in spec.geoms if g.name.endswith("_rubber")]:
+        spec.delete(geom)
+    spec.geom("LH_foot").size = [0.025, 0, 0]
+    text, found = drafted(spec, tmp_path)
+    assert "foot_radius = 0.025\n" in text
+    assert found.foot_radius == 0.025
+
+
+def test_a_trunk_whose_origin_is_behind_all_legs(tmp_path: Path) -> None:
+    spec = bodies.our_spec()
+    for leg in bodies.LEGS:
+        hip = spec.body(f"{leg}_hip")
+        hip.pos = hip.pos + np.asarray([0.25, 0.2, 0])
+    _, found = drafted(spec, tmp_path)
+    places = [(leg.name, leg.joints[0]) for leg in found.legs]
+    pairs = (("FL", "LF"), ("FR", "RF"), ("RL", "LH"), ("RR", "RH"))
+    assert places == [(corner, f"{leg}_abduction") for corner, leg in pairs]
+    for leg in found.legs:
+        assert (leg.name[1] == "L", leg.name[0] == "F") == (leg.left, leg.front)
+
+
+def test_names_that_toml_must_quote(tmp_path: Path) -> None:
+    spec = bodies.our_spec()
+    for servo in [*spec.actuators]:
+        spec.delete(servo)
+    spec.joint("LF_hip").name = 'the "left" \\ hip'
+    _, found = drafted(spec, tmp_path)
+    assert found.legs[0].joints[1] == 'the "left" \\ hip'
+
+
+def nameless(kind: str) -> mujoco.MjSpec:
+    spec = bodies.our_spec()
+    for servo in [*spec.actuators]:
+        spec.delete(servo)
+    getattr(spec, kind)("trunk" if kind == "body" else "LF_hip").name = ""
+    return spec
+
+
+def crowded() -> mujoco.MjSpec:
+    spec = bodies.our_spec()
+    spec.body("LH_hip").pos = [0.15, 0.0465, 0]
+    return spec
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        (lambda: nameless("joint"), "a joint of body 'LF_thigh' has no name; give it one in its"),
+        (lambda: nameless("body"), "the body of the free joint, the trunk, has no name"),
+        (crowded, r'of joints \["LF_abduction", "LH_abduction"\] both stand front left'),
+    ],
+)
+def test_what_cannot_be_drafted_is_said(
+    spec: Callable[[], mujoco.MjSpec], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(RobotError, match=message):
+        drafted(spec(), tmp_path)
 
 
 def test_what_is_no_quadruped_is_refused(tmp_path: Path) -> None:
