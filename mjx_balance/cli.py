@@ -370,6 +370,9 @@ def _robot_check(argv: list[str]) -> int:
     _check_out("picture", args.picture, ".png")
     scene, tilted = inspection.find_out(args.robot)
     print("\n".join(inspection.described(scene, tilted)))
+    short = inspection.shortcomings(scene, tilted)
+    for sentence in short:
+        print(f"mjx-balance: {sentence}", file=sys.stderr)
     picture = args.picture or Path(f"{scene.robot.name.replace(':', '_')}-check.png")
     try:
         render.write(picture, scene.config, tilted.qpos[None])
@@ -377,7 +380,7 @@ def _robot_check(argv: list[str]) -> int:
         print(f"mjx-balance: no picture drawn: {error}", file=sys.stderr)
         return FAILED
     print(f"picture: {picture}")
-    return 0
+    return FAILED if short else 0
 
 
 def _robot_new(argv: list[str]) -> int:

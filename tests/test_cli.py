@@ -326,6 +326,23 @@ def test_a_robots_draft_can_be_checked_and_trained(
     assert capsys.readouterr().out == Path("rex.toml").read_text()
 
 
+def test_a_robot_that_does_not_hold_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands on the level board, and is drawn where it ends on the tilted one."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
+    assert main(["robot", "new", "model.xml", "--out", "rex.toml"]) == 0
+    text = Path("rex.toml").read_text()
+    Path("rex.toml").write_text(text.replace("trunk =", "knee_torque = 5.6\ntrunk =", 1))
+    capsys.readouterr()
+    assert main(["robot", "check", "rex.toml"]) == 1
+    said = capsys.readouterr()
+    assert "mjx-balance: robot rex has no torque left at 7 deg" in said.err
+    assert "_knee' takes 100% of its own" in said.err
+    assert said.out.endswith("picture: rex.png\n")
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
