@@ -60,7 +60,7 @@ def tilted(scene: Scene) -> Tilted:
         torque_share=np.max([one.torque_share for one in found], axis=0),
         tilt=max(one.tilt for one in found),
         creep=max(one.creep for one in found),
-        qpos=max(found, key=lambda one: one.torque_share.max()).qpos,
+        qpos=max(found, key=lambda one: one.torque_share.max().round(3)).qpos,
     )
 
 
@@ -110,8 +110,8 @@ def shortcomings(scene: Scene, at_tilt: Tilted) -> list[str]:
 
 
 def _most_loaded(scene: Scene, at_tilt: Tilted) -> tuple[str, float]:
-    """The servo, and the share of its torque that it takes."""
-    leg, joint = np.unravel_index(np.argmax(at_tilt.torque_share), (4, 3))
+    """The servo, and the share of its torque that it takes; of mirror images, the first."""
+    leg, joint = np.unravel_index(np.argmax(at_tilt.torque_share.round(3)), (4, 3))
     return scene.robot.legs[leg].joints[joint], float(at_tilt.torque_share.max())
 
 

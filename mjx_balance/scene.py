@@ -10,6 +10,7 @@ from mjx_balance.config import Config, ConfigError
 from mjx_balance.robots import Robot, find_robot, robot_file, robot_spec
 from mjx_balance.robots.building import (
     ACCELEROMETER,
+    BOARD_SIZE,
     GYRO,
     VISUAL_GROUP,
     scene_dir,
@@ -87,14 +88,19 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
       config: gives the time step, the standing height and the foot friction.
       visual: whether to keep the geoms that are only looked at; without them
         MJX has a sixth of the geoms to move.
+
+    Raises:
+      ConfigError: if the robot's file asks for a board that its feet do not fit on.
     """
     robot = find_robot(config.robot)
     stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
     for looked in (*stage.cameras, *stage.worldbody.geoms):  # from as far as it is large
         looked.pos = looked.pos * robot.size_scale
     height = config.task.body_height
-    stage.attach(_board(robot), prefix=BOARD, frame=stage.worldbody.add_frame())
     body = robot_spec(config.robot, visual)
+    size = body.numeric(BOARD_SIZE)
+    board = _board(robot, None if size is None else float(size.data[0]))
+    stage.attach(board, prefix=BOARD, frame=stage.worldbody.add_frame())
     for name in (x for x in dir(stage.option) if not x.startswith("_")):
         setattr(body.option, name, getattr(stage.option, name))
     stage.attach(body, prefix=ROBOT, frame=stage.worldbody.add_frame(pos=[0, 0, height]))
@@ -115,10 +121,27 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
     return stage.compile()
 
 
-def _board(robot: Robot) -> mujoco.MjSpec:
-    """The board, as large, heavy and stiff for this robot as ours is for our own."""
+def _board(robot: Robot, size: float | None) -> mujoco.MjSpec:
+    """The board, as large, heavy and stiff for this robot as ours is for our own.
+
+    Args:
+      robot: gives mass and size.
+      size: length of the board, m; none: by the robot's.
+
+    Raises:
+      ConfigError: if its feet do not fit on a board of that size.
+    """
     board = mujoco.MjSpec.from_file(str(scene_dir() / "board.xml"))
     longer, heavier = robot.size_scale, robot.mass_scale
+    if size is not None:
+        half_length, half_width, _ = board.geom("board").size
+        longer = size / (2 * half_length)
+        feet = robot.half_length / half_length, robot.half_track / half_width
+        if longer < max(feet):
+            raise ConfigError(
+                f"robot {robot.name}: board_size is {size:g} m; for its feet to stand on the board "
+                f"it must be at least {2 * half_length * max(feet):.2f}"
+            )
     if longer == heavier == 1:
         return board
     for geom in board.geoms:

@@ -19,6 +19,8 @@ from mjx_balance.robots.record import Robot
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
 IMU = "balance_imu"
+BOARD_SIZE = "board_size"
+"""Number in the body's model: `RobotFile.board_size`, for the scene to be built by."""
 ALIKE = 1e-4
 """What feet's radii may differ by, m."""
 
@@ -142,6 +144,8 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
         bare = _compiled(spec)
     robot = measured(file, bare, names, radius)
     _equip(spec, robot, _imu(spec, trunk, bare, file))
+    if file.board_size is not None:
+        spec.add_numeric(name=BOARD_SIZE, data=[file.board_size])
     return spec, robot
 
 
@@ -184,7 +188,7 @@ def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
         spec.delete(actuator)
     # What refers to others goes before them.
     refer = [*spec.keys, *spec.sensors, *spec.excludes, *spec.pairs, *spec.equalities]
-    refer += [*spec.tuples, *spec.tendons, *spec.skins, *spec.flexes]
+    refer += [*spec.tuples, *spec.numerics, *spec.texts, *spec.tendons, *spec.skins, *spec.flexes]
     for element in (*refer, *joints):
         spec.delete(element)
     for body in bodies:

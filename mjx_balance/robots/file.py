@@ -66,6 +66,8 @@ class RobotFile:
     servo_armature: float | None = None
     body_height: float | None = None
     action_max: float | None = None
+    board_size: float | None = None
+    """Length of the board that it is trained on, m; none: by the robot's size."""
     source: str = ""
     """Of the model."""
     license: str = ""
@@ -75,6 +77,7 @@ class RobotFile:
 NUMBERS = (
     *("foot_radius", "foot_friction", "hip_torque", "knee_torque", "servo_stiffness"),
     *("servo_damping", "servo_armature", "body_height", "action_max"),
+    "board_size",
 )
 
 

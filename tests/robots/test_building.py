@@ -19,6 +19,7 @@ from mjx_balance.robots import (
     find_robot,
     robot_from_dict,
     robot_spec,
+    robot_xml,
     shipped,
 )
 from mjx_balance.robots.building import scene_dir
@@ -277,6 +278,30 @@ def test_the_board_grows_with_the_robot() -> None:
     np.testing.assert_allclose(heavy.inertia, 5.493 * 1.702**2 * light.inertia, rtol=1e-6)
     stiff, soft = (x.model.actuator("board/board_x") for x in (scene, ours))
     assert stiff.gainprm[0] == pytest.approx(5.493 * 1.702**2 * soft.gainprm[0])
+
+
+def test_the_boards_size_can_be_said(tmp_path: Path) -> None:
+    """1.4 m long, and wide and thick in proportion; its weight stays by the robot's."""
+    name = edited(tmp_path / "said", [], board_size="1.4")
+    plain = edited(tmp_path / "plain", [])
+    scene, ours = scene_of(name), scene_of(plain)
+    board, our_board = (x.model.geom("board/board") for x in (scene, ours))
+    np.testing.assert_allclose(board.size, [0.7, 0.56, 0.028])
+    assert board.pos[2] == pytest.approx(-0.028)
+    heavy, light = (x.model.body("board/board") for x in (scene, ours))
+    assert heavy.mass[0] == light.mass[0]
+    np.testing.assert_allclose(heavy.inertia, 1.4**2 * light.inertia)
+    assert our_board.size[0] == 0.5
+    assert scene.hash != ours.hash, "a policy of another board is another policy"
+    assert robot_xml(name) != robot_xml(plain), "and so is a program"
+
+
+def test_a_board_that_is_too_small(tmp_path: Path) -> None:
+    """Feet at 193 and 142 mm: 1 m of length has 0.8 m of width."""
+    name = edited(tmp_path, [], board_size="0.3")
+    message = "robot maker: board_size is 0.3 m; for its feet .* it must be at least 0.39"
+    with pytest.raises(ConfigError, match=message):
+        scene_of(name)
 
 
 @pytest.mark.parametrize("name", [*MAKERS, "quadruped"])
