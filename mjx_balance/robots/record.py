@@ -111,11 +111,6 @@ class Robot:
         return tuple(leg.joints for leg in self.legs)
 
     @property
-    def feet(self) -> tuple[str, ...]:
-        """Of each leg."""
-        return tuple(leg.foot for leg in self.legs)
-
-    @property
     def half_length(self) -> float:
         """Greatest fore-aft distance of a foot from the trunk's origin, m."""
         return max(abs(leg.x) for leg in self.legs)
