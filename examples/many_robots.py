@@ -4,7 +4,8 @@
     python examples/many_robots.py [--robots go1 b2 ...] [--unseen go2 spot] --out FOLDER
 
 Heights and height changes are told in shares of what fits a robot's size, so that one network can
-serve them all. It is not told which of them it stands on.
+serve them all. It is not told which of them it stands on. What the folder holds already is only
+judged again, beside the robots' own policies.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from mjx_balance.config import Config, fitted, preset
 from mjx_balance.engines.mujoco import cores
 from mjx_balance.env import BalanceEnv
 from mjx_balance.evaluation import observing, policy_scene, run_suite
-from mjx_balance.policy import load_policy, save_policy
+from mjx_balance.policy import Policy, load_policy, save_policy
 from mjx_balance.robots import shipped
 from mjx_balance.scene import load_scene
 from mjx_balance.suites import HEADLINE, SEEDS
@@ -87,6 +88,15 @@ def train(configs: Mapping[str, Config], unseen: Mapping[str, Config], out: Path
             save_policy(out / f"{name}.safetensors", weights, manifest)
 
 
+def judged(policy: Policy, suite: str, scenarios: int) -> str:
+    """Mean tilt over held-out scenarios of a minute, and how many of them end in a fall."""
+    made = run_suite(
+        policy_scene(policy), observing(policy), suite, scenarios, 60.0, SEEDS.held_out
+    )
+    falls = int(made.fell.sum())
+    return f"{made.tilt.mean():.3f}" + (f" ({falls} of {scenarios} fall)" if falls else "")
+
+
 def main() -> None:
     """Trains, writes, judges."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
@@ -111,13 +121,19 @@ def main() -> None:
     sized = devices.size_to_device(base)
     configs = {name: fitted(sized, name) for name in (*trained, *args.unseen)}
     seen = {name: configs[name] for name in trained}
-    train(seen, {name: configs[name] for name in args.unseen}, args.out)
-    for name in configs:
-        policy = load_policy(args.out / f"{name}.safetensors")
-        scene = policy_scene(policy)
+    files = {name: args.out / f"{name}.safetensors" for name in configs}
+    if not all(file.is_file() for file in files.values()):
+        train(seen, {name: configs[name] for name in args.unseen}, args.out)
+    columns = ["robot", "trained on it", *(f"`{x}`: one for all / its own" for x in HEADLINE)]
+    print(f"| {' | '.join(columns)} |")
+    print("| --- | --- | --- | --- |")
+    for name, file in files.items():
+        own = load_policy("best" if name == "quadruped" else name)
+        cells = [f"`{name}`", "yes" if name in seen else "no"]
         for suite in HEADLINE:
-            made = run_suite(scene, observing(policy), suite, args.scenarios, 60.0, SEEDS.held_out)
-            print(f"{name} {suite}: {made.tilt.mean():.3f} deg, {int(made.fell.sum())} falls")
+            both = [judged(policy, suite, args.scenarios) for policy in (load_policy(file), own)]
+            cells.append(" / ".join(both))
+        print(f"| {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -318,7 +318,7 @@ def test_a_robots_draft_can_be_checked_and_trained(
     assert main(["robot", "check", "rex.toml", "--picture", "rex.png"]) == 0
     said = capsys.readouterr().out
     assert "rex: 15.20 kg" in said
-    assert said.endswith("picture: rex.png\n")
+    assert said.endswith("picture: rex-check.png\n")
     assert Path("rex.png").stat().st_size > 50_000
     assert main(["robot", "check", "rex.toml"]) == 0
     assert capsys.readouterr().out.endswith("picture: rex-check.png\n")
@@ -340,7 +340,7 @@ def test_a_robot_that_does_not_hold_is_said(
     said = capsys.readouterr()
     assert "mjx-balance: robot rex has no torque left at 7 deg" in said.err
     assert "_knee' takes 100% of its own" in said.err
-    assert said.out.endswith("picture: rex.png\n")
+    assert said.out.endswith("picture: rex-check.png\n")
 
 
 @pytest.mark.parametrize(
