@@ -108,9 +108,11 @@ def controls(
     time = task.ctrl_dt * decision[..., None] + task.sim_dt * step
     board = tilt.board_angle(task, scenario, time) * (np.pi / 180)
     path = kinematics.ramp(task, memory.heights, heights)
+    moving = kinematics.joint_angles(robot, path[..., : task.ramp_steps, :])
+    resting = xp.repeat(moving[..., -1:, :, :], task.sim_steps - task.ramp_steps, axis=-3)
     commanded = extend_history(memory.commanded, wanted[..., None, :])
     memory = memory._replace(heights=heights, commanded=commanded)
-    return memory, Targets(board, kinematics.joint_angles(robot, path))
+    return memory, Targets(board, xp.concatenate((moving, resting), axis=-3))
 
 
 def outcome(
