@@ -9,6 +9,7 @@ import functools
 import time
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +30,10 @@ PPO = {
         ppo_networks.make_ppo_networks,
         policy_hidden_layer_sizes=NARROW,
         value_hidden_layer_sizes=NARROW,
+        activation=nn.tanh,  # with brax's own, SiLU, it ends at three times the tilt
     ),
+    "learning_rate_schedule": "ADAPTIVE_KL",  # a constant 1e-3 falls again after 20,000 decisions
+    "learning_rate_schedule_max_lr": 1e-3,
     "num_envs": 128,
     "unroll_length": 8,
     "batch_size": 32,  # unrolls: 256 decisions
