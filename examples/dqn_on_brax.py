@@ -54,7 +54,8 @@ def pendulum() -> Env:
 def train(env: Env, decisions: int, seed: int, num_envs: int = 64) -> tuple[Learner, Any]:
     """A learner and the state at the end of its run."""
     network = QNetwork(CONFIG.hidden_sizes, (env.action_size,))
-    learner = Learner(env, network, CONFIG, num_envs, decisions)
+    # One device, whatever there is: another number of them is another run.
+    learner = Learner(env, network, CONFIG, num_envs, decisions, jax.devices()[:1])
     state, _ = learner.train_program(decisions // num_envs)(learner.init(seed))
     return learner, state
 

@@ -1,6 +1,6 @@
 """Trains brax's PPO or SAC on `BalanceEnv` with continuous actions, and tries what it learnt.
 
-python examples/train_brax.py [--algorithm sac] [--decisions 20000] [--seed 0] [--engine mjx]
+python examples/train_brax.py [--algorithm sac] [--decisions 60000] [--seed 0] [--engine mjx]
 """
 
 import argparse
@@ -80,7 +80,7 @@ def main() -> None:
     """Trains as the command line says."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
     parser.add_argument("--algorithm", choices=TRAINERS, default="ppo")
-    parser.add_argument("--decisions", type=int, default=20_000)
+    parser.add_argument("--decisions", type=int, default=60_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--engine", choices=("mujoco", "mjx"), default="mujoco")
     args = parser.parse_args()
