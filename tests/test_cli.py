@@ -318,7 +318,7 @@ def test_a_robots_draft_can_be_checked_and_trained(
     assert main(["robot", "check", "rex.toml", "--picture", "rex.png"]) == 0
     said = capsys.readouterr().out
     assert "rex: 15.20 kg" in said
-    assert said.endswith("picture: rex-check.png\n")
+    assert said.endswith("picture: rex.png\n")
     assert Path("rex.png").stat().st_size > 50_000
     assert main(["robot", "check", "rex.toml"]) == 0
     assert capsys.readouterr().out.endswith("picture: rex-check.png\n")
