@@ -21,7 +21,7 @@ import numpy as np
 from markers import publish, table
 
 from mjx_balance.config import preset
-from mjx_balance.suites import HEADLINE
+from mjx_balance.evaluation.suites import HEADLINE
 
 
 def lags(samples: Iterable[int], commands: str) -> str:

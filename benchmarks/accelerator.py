@@ -46,17 +46,17 @@ SHARES = {"rates": 0.16, "training": 0.1, "whole run": 0.2}
 def sized(engine: Any, num_envs: int | None) -> Any:
     """Config and learner of the shipped policy; of preset `default` if a run is to choose."""
     from mjx_balance.config import preset
-    from mjx_balance.env import BalanceEnv
-    from mjx_balance.policy import load_policy
-    from mjx_balance.training import devices
+    from mjx_balance.envs.balance import BalanceEnv
+    from mjx_balance.policy.file import load_policy
+    from mjx_balance.training import sizing
 
     config = load_policy(POLICY).config if num_envs else preset("default")
     config = dataclasses.replace(
         config, engine=engine, num_envs=num_envs, num_devices=None, num_seeds=1
     )
-    config = devices.size_to_device(config)
+    config = sizing.size_to_device(config)
     env = BalanceEnv(config)
-    return config, devices.make_learner(config, env)
+    return config, sizing.make_learner(config, env)
 
 
 def kind() -> str:
@@ -72,7 +72,7 @@ def rates(engine: str, sizes: list[int]) -> None:
     import jax.numpy as jnp
     from safetensors.numpy import load_file
 
-    from mjx_balance.training import devices
+    from mjx_balance.training import sizing
 
     params: dict[str, Any] = {}
     found: dict[int, float] = {}
@@ -101,7 +101,7 @@ def rates(engine: str, sizes: list[int]) -> None:
         found[num_envs] = steps / sorted(seconds)[ROUNDS // 2]
         say(num_envs, found[num_envs], compile_s, mean_tilt_deg=tilt)
         if kind() == "gpu" and len(found) > 1:  # of one size nobody knows whether it is enough
-            devices.remember_envs(engine, found)
+            sizing.remember_envs(engine, found)
 
 
 def training(engine: str) -> None:
@@ -177,8 +177,8 @@ class Parts:
 
     def run(self, engine: str, num_envs: int, start: str, work: Path) -> dict[str, Any] | None:
         """A whole `train.py`; none if it did not end well or in time."""
-        from mjx_balance.training.devices import SIZES_FILE
         from mjx_balance.training.program_cache import cache_dir
+        from mjx_balance.training.sizing import SIZES_FILE
 
         name, seconds = f"whole run, {engine}, {start}", self.left("whole run")
         print(f"{name} ...", file=sys.stderr, flush=True)
@@ -357,8 +357,8 @@ def main() -> None:
         from mjx_balance.quiet import quiet_imports
 
         with quiet_imports("torch", *(["warp"] if args.engine != "warp" else [])):
-            from mjx_balance.training import devices
-        devices.configure_jax(lambda line: print(line, file=sys.stderr))
+            from mjx_balance.training import sizing
+        sizing.configure_jax(lambda line: print(line, file=sys.stderr))
         if args.part == "rates":
             rates(args.engine, args.sizes)
         else:

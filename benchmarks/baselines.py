@@ -2,7 +2,7 @@
 
 Coordinate search: each parameter in turn is set to the best of a few values, until a
 round changes nothing. The score is the mean tilt over a suite, falls counting as 6 deg.
-The winners for suite `paper` are the defaults in `mjx_balance/controllers.py`; `--suite
+The winners for suite `paper` are the defaults in `mjx_balance/evaluation/controllers.py`; `--suite
 latency` shows what the same controllers reach if they are tuned for late actions instead.
 
     python benchmarks/baselines.py [--scenarios 16] [--duration 40] [--suite paper]
@@ -21,10 +21,10 @@ from pathlib import Path
 from markers import publish, table
 
 from mjx_balance.config import preset
-from mjx_balance.controllers import AttitudePD, ImuPD, make_controller
-from mjx_balance.evaluation import run_suite, summarize
-from mjx_balance.scene import load_scene
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.evaluation.controllers import AttitudePD, ImuPD, make_controller
+from mjx_balance.evaluation.rollout import run_suite, summarize
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.sim.scene import load_scene
 
 GRIDS: Mapping[type, Mapping[str, Sequence[float]]] = {
     AttitudePD: {

@@ -26,11 +26,11 @@ from typing import Any, NamedTuple
 from markers import publish, table
 from throughput import hardware
 
-from mjx_balance import evaluation
 from mjx_balance.config import preset
-from mjx_balance.controllers import Controller
-from mjx_balance.scene import Scene
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.evaluation.controllers import Controller
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.sim.scene import Scene
 
 CONTENDERS = ("ours", "ppo", "sac")
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "train_brax.py"
@@ -122,10 +122,10 @@ def our_rows(name: str, budgets: Sequence[float], seed: int) -> Iterator[dict[st
     """Rows of preset `default`."""
     import jax
 
-    from mjx_balance.engines.mujoco import cores
-    from mjx_balance.env import BalanceEnv
-    from mjx_balance.policy import make_manifest, save_policy
-    from mjx_balance.training.devices import make_learner, size_to_device
+    from mjx_balance.envs.balance import BalanceEnv
+    from mjx_balance.policy.file import make_manifest, save_policy
+    from mjx_balance.sim.engines.mujoco import cores
+    from mjx_balance.training.sizing import make_learner, size_to_device
 
     jax.config.update("jax_num_cpu_devices", cores())
     config = dataclasses.replace(preset("default"), engine="mujoco", seed=seed)

@@ -22,14 +22,14 @@ with quiet_imports("torch", "warp"):
     import jax
 
     from mjx_balance.config import preset
-    from mjx_balance.env import BalanceEnv
-    from mjx_balance.training import checkpoints, devices
+    from mjx_balance.envs.balance import BalanceEnv
+    from mjx_balance.training import checkpoints, sizing
 
 
 def seconds(name: str, rounds: int) -> tuple[int, float, float]:
     """Bytes of a preset's state, and medians of the times to save and to restore it."""
-    config = devices.size_to_device(dataclasses.replace(preset(name), engine="mujoco"))
-    learner = devices.make_learner(config, BalanceEnv(config))
+    config = sizing.size_to_device(dataclasses.replace(preset(name), engine="mujoco"))
+    learner = sizing.make_learner(config, BalanceEnv(config))
     state = jax.block_until_ready(learner.init(0))
     saving, restoring = [], []
     with tempfile.TemporaryDirectory() as work:
@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--write", type=Path, help="Markdown file with markers")
     args = parser.parse_args()
-    devices.configure_jax(print)
+    sizing.configure_jax(print)
     rows = []
     for name in args.presets:
         size, save, restore = seconds(name, args.rounds)

@@ -13,12 +13,13 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from mjx_balance import evaluation, load_policy
+from mjx_balance import load_policy
 from mjx_balance.config import Config
-from mjx_balance.controllers import Controller, View
-from mjx_balance.policy import Policy
-from mjx_balance.scene import Scene
-from mjx_balance.suites import make_scenarios
+from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.evaluation.controllers import Controller, View
+from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.policy.file import Policy
+from mjx_balance.sim.scene import Scene
 
 PYRAMIDAL = {"cone": float(mujoco.mjtCone.mjCONE_PYRAMIDAL)}
 VARIANTS: dict[str, dict[str, float]] = {

@@ -19,7 +19,7 @@ from mujoco.batch import Batch
 from throughput import hardware
 
 import mjx_balance
-from mjx_balance.engines.mujoco import cores
+from mjx_balance.sim.engines.mujoco import cores
 
 DECISIONS = 4096
 """Of all boards together, in a round."""

@@ -16,8 +16,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from mjx_balance.policy import load_policy
-from mjx_balance.run_folder import RunFolder
+from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.policy.file import load_policy
 from mjx_balance.training.checkpoints import saved_steps
 
 REPO = Path(__file__).resolve().parent.parent

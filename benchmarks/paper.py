@@ -19,11 +19,11 @@ from typing import Any
 from markers import publish, table
 from rich.console import Console
 
-from mjx_balance.display import Display
-from mjx_balance.evaluation import evaluate
-from mjx_balance.policy import load_policy
-from mjx_balance.run_folder import RunFolder
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.evaluation.rollout import evaluate
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.policy.file import load_policy
+from mjx_balance.report.progress import Display
 
 DURATION = 60.0
 

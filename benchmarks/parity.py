@@ -20,11 +20,11 @@ from markers import publish, table
 
 from mjx_balance import load_policy
 from mjx_balance.config import RandomizationConfig
-from mjx_balance.controllers import View
-from mjx_balance.env import BalanceEnv
-from mjx_balance.evaluation import policy_scene, roll_out
-from mjx_balance.policy import Policy
-from mjx_balance.suites import SEEDS, make_scenarios
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.evaluation.controllers import View
+from mjx_balance.evaluation.rollout import policy_scene, roll_out
+from mjx_balance.evaluation.suites import SEEDS, make_scenarios
+from mjx_balance.policy.file import Policy
 from mjx_balance.task.randomization import Conditions
 from mjx_balance.task.tilt import Scenario
 

@@ -27,11 +27,11 @@ with quiet_imports("torch", "warp"):
     from flax import linen as nn
 
     from mjx_balance.config import preset
-    from mjx_balance.env import BalanceEnv
-    from mjx_balance.evaluation import evaluate
-    from mjx_balance.policy import make_manifest, save_policy
-    from mjx_balance.suites import HEADLINE
-    from mjx_balance.training import devices
+    from mjx_balance.envs.balance import BalanceEnv
+    from mjx_balance.evaluation.rollout import evaluate
+    from mjx_balance.evaluation.suites import HEADLINE
+    from mjx_balance.policy.file import make_manifest, save_policy
+    from mjx_balance.training import sizing
 
 MANTISSA = {"float32": 23, "TF32": 10, "bfloat16": 7}
 """Bits that a number keeps; its exponent stays."""
@@ -72,9 +72,9 @@ def with_products_of(bits: int) -> Any:
 def results(precision: str, num_envs: int, seed: int, scenarios: int) -> list[dict[str, Any]]:
     """Evaluations of one training in the headline suites."""
     config = dataclasses.replace(preset("default"), engine="mujoco")
-    config = devices.size_to_device(devices.widened(config, num_envs))
+    config = sizing.size_to_device(sizing.widened(config, num_envs))
     env = BalanceEnv(config)
-    learner = devices.make_learner(config, env)
+    learner = sizing.make_learner(config, env)
     with with_products_of(MANTISSA[precision]):
         program, state = learner.train_program(8), learner.init(seed)
         for _ in range(-(-config.num_env_steps // (8 * num_envs))):
@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, default=64)
     parser.add_argument("--write", type=Path, help="Markdown file with markers")
     args = parser.parse_args()
-    devices.configure_jax(print)
+    sizing.configure_jax(print)
     rows = []
     for precision, num_envs in VARIANTS:
         each = [results(precision, num_envs, seed, args.scenarios) for seed in args.seeds]

@@ -14,11 +14,11 @@ import numpy as np
 from markers import publish, table
 
 from mjx_balance.config import TaskConfig, preset
-from mjx_balance.controllers import Controller, make_controller
-from mjx_balance.evaluation import observing, policy_scene, roll_out
-from mjx_balance.policy import load_policy
-from mjx_balance.scene import Scene, load_scene
-from mjx_balance.suites import SEEDS, SUITES, make_pushes, make_scenarios
+from mjx_balance.evaluation.controllers import Controller, make_controller
+from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out
+from mjx_balance.evaluation.suites import SEEDS, SUITES, make_pushes, make_scenarios
+from mjx_balance.policy.file import load_policy
+from mjx_balance.sim.scene import Scene, load_scene
 
 BASELINES = ("pd-imu", "pd-attitude", "rate-oracle", "clairvoyant")
 SETTLED = 0.2

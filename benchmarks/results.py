@@ -20,9 +20,8 @@ from markers import publish, table
 from rich.console import Console
 
 from mjx_balance import load_policy
-from mjx_balance.controllers import CONTROLLERS, make_controller
-from mjx_balance.display import Display
-from mjx_balance.evaluation import (
+from mjx_balance.evaluation.controllers import CONTROLLERS, make_controller
+from mjx_balance.evaluation.rollout import (
     Controller,
     Envelope,
     envelope,
@@ -31,11 +30,12 @@ from mjx_balance.evaluation import (
     run_suite,
     summarize,
 )
-from mjx_balance.policy import Policy
+from mjx_balance.evaluation.statistics import TILTS, over_seeds
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS, SUITES
+from mjx_balance.policy.file import Policy
 from mjx_balance.report.digest import code_digest
 from mjx_balance.report.measuring import ENVELOPE_DURATION, ENVELOPE_SCENARIOS
-from mjx_balance.statistics import TILTS, over_seeds
-from mjx_balance.suites import HEADLINE, SEEDS, SUITES
+from mjx_balance.report.progress import Display
 
 DURATION = 60.0
 BOARDS = ("fast", "steep")

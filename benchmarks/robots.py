@@ -22,12 +22,13 @@ from markers import publish, table
 from PIL import Image, ImageDraw
 from throughput import hardware
 
-from mjx_balance import load_policy, render
-from mjx_balance.controllers import make_controller
-from mjx_balance.evaluation import observing, policy_scene, run_suite
-from mjx_balance.inspection import tilted
-from mjx_balance.robots import shipped
-from mjx_balance.suites import SEEDS
+from mjx_balance import load_policy
+from mjx_balance.cli.inspection import tilted
+from mjx_balance.evaluation.controllers import make_controller
+from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
+from mjx_balance.evaluation.suites import SEEDS
+from mjx_balance.render import drawing as render
+from mjx_balance.robots.catalogue import shipped
 
 REPO = Path(__file__).resolve().parent.parent
 SUITES = ("paper", "corner", "push")

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from mjx_balance.config import Config, preset
-from mjx_balance.gym_envs import BalanceGymEnv
-from mjx_balance.policy import Policy, make_manifest, save_policy
+from mjx_balance.envs.gym import BalanceGymEnv
+from mjx_balance.policy.file import Policy, make_manifest, save_policy
 
 HIDDEN = (256, 256)
 EXPLORE = 20_000

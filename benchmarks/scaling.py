@@ -49,16 +49,16 @@ def child(place: Any, engine: Any, num_envs: int, batches: int, rounds: int) -> 
     from mjx_balance.config import preset
     from mjx_balance.dqn.devices import mean_over_devices, on_each_device
     from mjx_balance.dqn.learner import REPLICATED
-    from mjx_balance.env import BalanceEnv
-    from mjx_balance.training import devices, processes
+    from mjx_balance.envs.balance import BalanceEnv
+    from mjx_balance.training import processes, sizing
 
     with processes.joined(place, ()) as us:
-        devices.configure_jax(print)
+        sizing.configure_jax(print)
         config = preset("default")
         dqn = dataclasses.replace(config.dqn, batch_size=batches * config.dqn.batch_size)
         config = dataclasses.replace(config, engine=engine, num_envs=num_envs, dqn=dqn)
-        config = devices.size_to_device(config)
-        learner = devices.make_learner(config, BalanceEnv(config))
+        config = sizing.size_to_device(config)
+        learner = sizing.make_learner(config, BalanceEnv(config))
         iterations = max(1, DECISIONS_PER_CALL // num_envs)
         state = learner.init(0)
         program, _ = compiled(learner.train_program(iterations), state)

@@ -27,17 +27,17 @@ def measure(engine: Any, num_seeds: int, num_envs: int, rounds: int) -> dict[str
     with quiet_imports("torch", "warp"):
         import jax
 
-        from mjx_balance.env import BalanceEnv
-        from mjx_balance.training import devices
+        from mjx_balance.envs.balance import BalanceEnv
+        from mjx_balance.training import sizing
     from mjx_balance.config import preset
 
-    devices.configure_jax(print)
+    sizing.configure_jax(print)
     jax.config.update("jax_enable_compilation_cache", False)  # to time the compilation
     config = dataclasses.replace(
         preset("default"), engine=engine, num_envs=num_envs // num_seeds, num_seeds=num_seeds
     )
-    config = devices.size_to_device(config)
-    learner = devices.make_learner(config, BalanceEnv(config))
+    config = sizing.size_to_device(config)
+    learner = sizing.make_learner(config, BalanceEnv(config))
     iterations = max(1, DECISIONS_PER_CALL // num_envs)
     state = learner.init(0)
     program, compile_s = compiled(learner.train_program(iterations), state)

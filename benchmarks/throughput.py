@@ -37,16 +37,16 @@ def measure(engine: Any, num_envs: int, preset_name: str, rounds: int) -> dict[s
     with quiet_imports("torch", *(["warp"] if engine != "warp" else [])):
         import jax
 
-        from mjx_balance.env import BalanceEnv
-        from mjx_balance.training import devices
+        from mjx_balance.envs.balance import BalanceEnv
+        from mjx_balance.training import sizing
     from mjx_balance.config import preset
 
     config = dataclasses.replace(preset(preset_name), engine=engine, num_envs=num_envs)
-    devices.configure_jax(print)
+    sizing.configure_jax(print)
     jax.config.update("jax_enable_compilation_cache", False)  # to time the compilation
-    config = devices.size_to_device(config)
+    config = sizing.size_to_device(config)
     env = BalanceEnv(config)
-    learner = devices.make_learner(config, env)
+    learner = sizing.make_learner(config, env)
     iterations = max(1, DECISIONS_PER_CALL // num_envs)
     decisions = iterations * num_envs
 

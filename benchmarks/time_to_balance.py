@@ -26,12 +26,12 @@ from markers import publish, table
 from rich.console import Console
 from throughput import hardware
 
-from mjx_balance import evaluation
 from mjx_balance.config import preset
-from mjx_balance.display import Display
-from mjx_balance.policy import load_policy
-from mjx_balance.run_folder import RunFolder, write_json
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.files.run_folder import RunFolder, write_json
+from mjx_balance.policy.file import load_policy
+from mjx_balance.report.progress import Display
 
 HERE = Path(__file__).resolve().parent
 ENGINES = ("mujoco", "mjx")

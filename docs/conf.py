@@ -16,7 +16,7 @@ sys.path.insert(0, str(REPO))
 from mjx_balance.quiet import quiet_imports  # noqa: E402
 
 with quiet_imports("torch", "warp"):  # MJX prints that it finds no Warp
-    import mjx_balance.env  # noqa: F401
+    import mjx_balance.envs.balance  # noqa: F401
 
 project = html_title = "mjx_balance"
 author, copyright = "the authors of mjx_balance", "the authors of mjx_balance, Apache-2.0"

@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_balance import load_policy
 from mjx_balance.config import preset
-from mjx_balance.robots import find_robot
+from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.task.kinematics import ramp
 
 HERE = Path(__file__).resolve().parent

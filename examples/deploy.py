@@ -8,10 +8,10 @@ import argparse
 import mujoco
 import numpy as np
 
-from mjx_balance.evaluation import policy_scene
-from mjx_balance.policy import PolicyError, find_policy, load_policy
+from mjx_balance.evaluation.rollout import policy_scene
+from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.policy.file import PolicyError, find_policy, load_policy
 from mjx_balance.runtime import Controller, State
-from mjx_balance.suites import make_scenarios
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.tilt import board_angle
 

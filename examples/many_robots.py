@@ -22,14 +22,14 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
 from mjx_balance.config import Config, fitted, preset
-from mjx_balance.engines.mujoco import cores
-from mjx_balance.env import BalanceEnv
-from mjx_balance.evaluation import observing, policy_scene, run_suite
-from mjx_balance.policy import Policy, load_policy, save_policy
-from mjx_balance.robots import shipped
-from mjx_balance.scene import load_scene
-from mjx_balance.suites import HEADLINE, SEEDS
-from mjx_balance.training import devices
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.policy.file import Policy, load_policy, save_policy
+from mjx_balance.robots.catalogue import shipped
+from mjx_balance.sim.engines.mujoco import cores
+from mjx_balance.sim.scene import load_scene
+from mjx_balance.training import sizing
 from mjx_balance.training.validation import exports
 
 CALL = 16
@@ -76,7 +76,7 @@ def train(configs: Mapping[str, Config], unseen: Mapping[str, Config], out: Path
     """Trains one network on some robots; writes its policies for them and for others."""
     fleet = Fleet(list(configs.values()))
     first = next(iter(configs.values()))
-    learner = devices.make_learner(first, fleet)
+    learner = sizing.make_learner(first, fleet)
     program, state, began = learner.train_program(CALL), learner.init(first.seed), time.monotonic()
     while (done := int(state.env_steps)) < first.num_env_steps:
         state, metrics = program(state)
@@ -118,7 +118,7 @@ def main() -> None:
         num_envs=args.envs * len(trained),
         num_env_steps=args.decisions * len(trained),
     )
-    sized = devices.size_to_device(base)
+    sized = sizing.size_to_device(base)
     configs = {name: fitted(sized, name) for name in (*trained, *args.unseen)}
     seen = {name: configs[name] for name in trained}
     files = {name: args.out / f"{name}.safetensors" for name in configs}

@@ -18,11 +18,12 @@ from brax.training.agents.ppo import train as ppo
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as sac
 
-from mjx_balance import BalanceEnv, evaluation
-from mjx_balance.brax_training import wrap
+from mjx_balance import BalanceEnv
 from mjx_balance.config import preset
-from mjx_balance.controllers import Controller
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.envs.brax import wrap
+from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.evaluation.controllers import Controller
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 
 NARROW = (64, 64)
 PPO = {

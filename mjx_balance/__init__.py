@@ -6,12 +6,12 @@ where JAX is not installed. Where Gymnasium is, it knows `mjx_balance/Balance-v0
 
 from typing import TYPE_CHECKING
 
-from mjx_balance.gym_registration import register_when_imported
-from mjx_balance.policy import load_policy
+from mjx_balance.envs.registration import register_when_imported
+from mjx_balance.policy.file import load_policy
 from mjx_balance.quiet import quiet_imports
 
 if TYPE_CHECKING:
-    from mjx_balance.env import BalanceEnv
+    from mjx_balance.envs.balance import BalanceEnv
 
 __all__ = ["BalanceEnv", "load_policy"]
 
@@ -21,7 +21,7 @@ register_when_imported()
 def __getattr__(name: str) -> object:
     if name == "BalanceEnv":
         with quiet_imports("torch"):
-            from mjx_balance.env import BalanceEnv
+            from mjx_balance.envs.balance import BalanceEnv
 
         return BalanceEnv
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

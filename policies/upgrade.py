@@ -15,8 +15,8 @@ import safetensors
 import safetensors.numpy
 
 from mjx_balance.config import Config, check, from_dict
-from mjx_balance.policy import FORMAT_VERSION, UPGRADED, Policy, load_policy, make_manifest
-from mjx_balance.scene import load_scene
+from mjx_balance.policy.file import FORMAT_VERSION, UPGRADED, Policy, load_policy, make_manifest
+from mjx_balance.sim.scene import load_scene
 
 
 def upgrade(path: Path) -> None:

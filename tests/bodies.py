@@ -9,8 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_balance.robots import Robot
-from mjx_balance.robots.building import scene_dir
+from mjx_balance.robots.build import scene_dir
+from mjx_balance.robots.catalogue import Robot
 
 
 def with_legs(robot: Robot, **changes: Any) -> Robot:

@@ -12,8 +12,8 @@ import pytest
 from fleet import ENVS, EPISODE, Feedback, Fleet, drive, keys, make_fleet, nominal, under
 
 from mjx_balance.config import Config, preset
-from mjx_balance.robots import Robot, find_robot
-from mjx_balance.scene import Scene, load_scene
+from mjx_balance.robots.catalogue import Robot, find_robot
+from mjx_balance.sim.scene import Scene, load_scene
 
 jax.config.update("jax_num_cpu_devices", 2)
 # The suite compiles longer than it computes. XLA reads this when its first device is asked for.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_balance.config import Config, RandomizationConfig, check, preset
-from mjx_balance.env import BalanceEnv
+from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.task.observation import observation_names
 from mjx_balance.task.randomization import Conditions
 

@@ -20,8 +20,8 @@ from flax import linen as nn
 from mjx_balance.config import DQNConfig, TaskConfig
 from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
-from mjx_balance.evaluation import Rollout
-from mjx_balance.policy import load_policy
+from mjx_balance.evaluation.rollout import Rollout
+from mjx_balance.policy.file import load_policy
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SCRIPTS = sorted(

@@ -30,11 +30,15 @@ import pytest
 import yaml
 from brax.training.agents.ppo import train as ppo
 
-from mjx_balance import brax_training, cli, config, env, evaluation, render, runtime
-from mjx_balance.engines.compiled import mujoco_engine
+from mjx_balance import cli, config, runtime
+from mjx_balance.envs import balance as env
+from mjx_balance.envs import brax as brax_training
+from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.render import drawing as render
 from mjx_balance.report import page as report_page
-from mjx_balance.robots import find_robot, shipped
-from mjx_balance.robots.file import LegFile, RobotFile, parse_robot_file
+from mjx_balance.robots.catalogue import find_robot, shipped
+from mjx_balance.robots.schema import LegFile, RobotFile, parse_robot_file
+from mjx_balance.sim.engines.compiled import mujoco_engine
 from mjx_balance.training import processes, run
 
 REPO = Path(__file__).resolve().parent.parent

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_balance import env as env_module
 from mjx_balance.config import Config, preset
-from mjx_balance.engines.engine import Engine, Motion, PhysicsState
-from mjx_balance.env import BalanceEnv
-from mjx_balance.evaluation import evaluate
-from mjx_balance.policy import Policy, make_manifest, save_policy
-from mjx_balance.robots import find_robot
-from mjx_balance.scene import Scene
+from mjx_balance.envs import balance as env_module
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.evaluation.rollout import evaluate
+from mjx_balance.policy.file import Policy, make_manifest, save_policy
+from mjx_balance.robots.catalogue import find_robot
+from mjx_balance.sim.engines.engine import Engine, Motion, PhysicsState
+from mjx_balance.sim.scene import Scene
 from mjx_balance.task.observation import observation_names
-from mjx_balance.training.devices import make_learner, size_to_device
+from mjx_balance.training.sizing import make_learner, size_to_device
 
 ENVS, DECISIONS, CALLS = 64, 8_192, 4
 ROUNDS = DECISIONS // ENVS

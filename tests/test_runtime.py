@@ -24,12 +24,18 @@ from hypothesis import strategies as st
 
 from mjx_balance import runtime
 from mjx_balance.config import Config, to_dict
-from mjx_balance.evaluation import observing, policy_scene, roll_out, run_suite
-from mjx_balance.policy import Policy, load_policy, make_manifest, network_branches, save_policy
-from mjx_balance.robots import Robot, find_robot
+from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out, run_suite
+from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.policy.file import (
+    Policy,
+    load_policy,
+    make_manifest,
+    network_branches,
+    save_policy,
+)
+from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.runtime import ACCEL_MOST, GYRO_MOST, Controller, PolicyFileError, State
-from mjx_balance.scene import Scene
-from mjx_balance.suites import make_scenarios
+from mjx_balance.sim.scene import Scene
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.kinematics import joint_angles
 from mjx_balance.task.observation import observation_names
@@ -608,7 +614,7 @@ def test_a_file_beyond_every_policy_is_not_even_read(tmp_path: Path) -> None:
         (lambda w, m: w.update({"head/bias": np.zeros(7, np.float32)}), r"shape \(42,\)"),
         (lambda w, m: w["hidden_1/kernel"].fill(np.nan), "hidden_1/kernel holds .* not finite"),
         (lambda w, m: w.update({"head/bias": np.zeros(42)}), "head/bias is F64; it must be F32"),
-        (lambda w, m: m.update(version=3), "is mjx_balance.policy version 3; .* version 4"),
+        (lambda w, m: m.update(version=3), "is mjx_balance.policy.file version 3; .* version 4"),
         (lambda w, m: m.update(format="onnx"), "it is onnx version 4"),
         (lambda w, m: m.clear(), "carries no manifest"),
         (lambda w, m: m.pop("robot"), "its manifest lacks 'robot'"),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mjx_balance.robots import shipped
+from mjx_balance.robots.catalogue import shipped
 
 REPO = Path(__file__).resolve().parent.parent
 MOST_BYTES = 3_000_000

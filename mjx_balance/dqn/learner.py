@@ -26,7 +26,6 @@ from mjx_balance.dqn import replay, whitening
 from mjx_balance.dqn.acting import epsilon, explore
 from mjx_balance.dqn.collecting import Collected, Reset, array, collect, finite, fresh
 from mjx_balance.dqn.devices import AXIS, device_key, on_each_device
-from mjx_balance.dqn.heads import Head
 from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.dqn.replay import ReplayState, Transition
@@ -39,6 +38,7 @@ from mjx_balance.dqn.updating import (
     update,
 )
 from mjx_balance.dqn.whitening import InputStatistics
+from mjx_balance.policy.heads import Head
 
 REPLICATED = PartitionSpec()
 Metrics: TypeAlias = dict[str, jax.Array]

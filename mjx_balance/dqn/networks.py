@@ -7,7 +7,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mjx_balance.dqn import heads
+from mjx_balance.policy import heads
 
 
 class QNetwork(nn.Module):

@@ -12,9 +12,9 @@ import optax
 
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn.devices import mean_over_devices
-from mjx_balance.dqn.heads import Head
 from mjx_balance.dqn.means import Mean
 from mjx_balance.dqn.replay import Transition
+from mjx_balance.policy.heads import Head
 
 Params: TypeAlias = Any
 """A network's variables, a flax pytree."""

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import mujoco
 
-from mjx_balance import evaluation
-from mjx_balance.sources import PACKAGE, code
+from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.files.sources import PACKAGE, code
 
 
 def code_digest(package: Path = PACKAGE) -> str:

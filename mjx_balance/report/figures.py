@@ -10,10 +10,10 @@ import matplotlib as mpl
 import numpy as np
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.evaluation import Envelope, Rollout
-from mjx_balance.run_folder import write_atomically
-from mjx_balance.scene import Scene
-from mjx_balance.suites import HEADLINE
+from mjx_balance.evaluation.rollout import Envelope, Rollout
+from mjx_balance.evaluation.suites import HEADLINE
+from mjx_balance.files.run_folder import write_atomically
+from mjx_balance.sim.scene import Scene
 from mjx_balance.task.attitude import roll_pitch
 from mjx_balance.task.reward import reward_terms
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from mjx_balance.config import to_dict
-from mjx_balance.controllers import CONTROLLERS, Controller, make_controller
-from mjx_balance.evaluation import (
+from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_controller
+from mjx_balance.evaluation.rollout import (
     Envelope,
     Rollout,
     envelope,
@@ -20,7 +20,9 @@ from mjx_balance.evaluation import (
     run_suite,
     summarize,
 )
-from mjx_balance.policy import Policy
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.files.run_folder import read_json
+from mjx_balance.policy.file import Policy
 from mjx_balance.report.digest import code_digest
 from mjx_balance.report.reading import (
     FOREIGN,
@@ -31,9 +33,7 @@ from mjx_balance.report.reading import (
     series,
     suite_result,
 )
-from mjx_balance.run_folder import read_json
-from mjx_balance.scene import Scene
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.sim.scene import Scene
 
 DURATION = 60.0
 ENVELOPE_SCENARIOS = 2

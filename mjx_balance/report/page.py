@@ -11,18 +11,18 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 
-from mjx_balance import render
 from mjx_balance.config import Config, ConfigError, TaskConfig, flatten, preset, to_dict
-from mjx_balance.evaluation import SETTLED_SECONDS, Envelope, policy_scene
-from mjx_balance.policy import Policy, PolicyError
+from mjx_balance.evaluation.rollout import SETTLED_SECONDS, Envelope, policy_scene
+from mjx_balance.evaluation.statistics import TILTS, over_seeds
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.files.run_folder import RunFolder, write_atomically
+from mjx_balance.policy.file import Policy, PolicyError
+from mjx_balance.render import drawing as render
 from mjx_balance.report import figures, measuring
 from mjx_balance.report.measuring import Measured
 from mjx_balance.report.reading import Run, read_run
 from mjx_balance.report.tables import spread
-from mjx_balance.run_folder import RunFolder, write_atomically
-from mjx_balance.scene import Scene
-from mjx_balance.statistics import TILTS, over_seeds
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.sim.scene import Scene
 
 TEMPLATE = "page.html"
 SEES = {

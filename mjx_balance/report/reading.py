@@ -12,10 +12,10 @@ from typing import Any
 
 from mjx_balance.config import Config, check, from_dict
 from mjx_balance.errors import InputError
-from mjx_balance.policy import Policy, load_policy
+from mjx_balance.evaluation.statistics import TILTS
+from mjx_balance.files.run_folder import RunFolder, parse_json, read_json
+from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report.figures import CURVES, HELD_OUT
-from mjx_balance.run_folder import RunFolder, parse_json, read_json
-from mjx_balance.statistics import TILTS
 
 METRICS_BYTES = 8 * 2**20
 """So much of metrics.jsonl is read."""

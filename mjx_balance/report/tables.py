@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mjx_balance.run_folder import RunFolder
-from mjx_balance.statistics import TILTS
+from mjx_balance.evaluation.statistics import TILTS
+from mjx_balance.files.run_folder import RunFolder
 
 SHOWN = ("mean", "p50", "p95", "p99", "max")
 """Tilt statistics of an evaluation that its table shows."""

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.robots.building import ALIKE, read_model, words
-from mjx_balance.robots.file import RobotError, parse_robot_file
-from mjx_balance.robots.measuring import ancestors
+from mjx_balance.robots.build import ALIKE, read_model, words
+from mjx_balance.robots.measure import ancestors
+from mjx_balance.robots.schema import RobotError, parse_robot_file
 
 HEADER = """\
 # Drafted from the model's structure; a corner's letters say front or rear, left or right.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mjx_balance.config import ConfigError, TaskConfig, shown
-from mjx_balance.robots import Robot
+from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
 ACTIONS = ("discrete", "continuous")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.robots import Robot
+from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array, kinematics, tilt
 from mjx_balance.task.actions import apply_action
 from mjx_balance.task.observation import extend_history, observe

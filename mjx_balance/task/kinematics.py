@@ -8,7 +8,7 @@ body"). Feet move straight up and down under their hips.
 import numpy as np
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.robots import Robot
+from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
 

@@ -6,7 +6,7 @@ On request the commanded foot heights follow the measured ones.
 import numpy as np
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.robots import Robot
+from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
 IMU_CHANNELS = 6

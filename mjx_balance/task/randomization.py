@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_balance.config import RandomizationConfig
-from mjx_balance.robots import Robot
+from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
 DRAWS = 6

@@ -7,15 +7,15 @@ from typing import Any
 
 from tensorboardX import SummaryWriter
 
-from mjx_balance import evaluation
 from mjx_balance.config import Config, ConfigError, combinations, members
-from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
-from mjx_balance.policy import Policy, PolicyError, load_policy, save_policy
+from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.evaluation.statistics import over_seeds
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.files.run_folder import RunFolder, write_atomically, write_json
+from mjx_balance.policy.file import Policy, PolicyError, load_policy, save_policy
 from mjx_balance.report import tables
-from mjx_balance.run_folder import RunFolder, write_atomically, write_json
-from mjx_balance.statistics import over_seeds
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.report.progress import Display
 from mjx_balance.training.program_cache import Say
 from mjx_balance.training.validation import Results, best_validated, exports, scalars, score
 

@@ -18,9 +18,9 @@ import numpy as np
 from tensorboardX import SummaryWriter
 
 from mjx_balance.config import Config, members
-from mjx_balance.display import Display
 from mjx_balance.dqn.learner import TrainState
-from mjx_balance.run_folder import RunFolder, keep_metrics_until, keep_validated_until
+from mjx_balance.files.run_folder import RunFolder, keep_metrics_until, keep_validated_until
+from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints
 from mjx_balance.training.processes import ALONE, Processes
 

@@ -21,11 +21,11 @@ import jax.numpy as jnp
 from jax import export
 
 from mjx_balance.config import Config, to_dict
-from mjx_balance.engines import ffi
-from mjx_balance.robots import robot_xml
-from mjx_balance.run_folder import write_atomically
-from mjx_balance.scene import scene_dir
-from mjx_balance.sources import code
+from mjx_balance.files.run_folder import write_atomically
+from mjx_balance.files.sources import code
+from mjx_balance.robots.catalogue import robot_xml
+from mjx_balance.sim.engines import ffi
+from mjx_balance.sim.scene import scene_dir
 
 LIBRARIES = ("mjx_balance", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax")
 """What a run's bits depend on besides this package's code."""

@@ -10,11 +10,9 @@ from typing import Any
 import jax
 
 from mjx_balance.config import Config, ConfigError, check, flatten, members, to_dict
-from mjx_balance.display import Display
 from mjx_balance.dqn.learner import Learner, TrainState
-from mjx_balance.env import BalanceEnv
-from mjx_balance.policy import Policy, PolicyError
-from mjx_balance.run_folder import (
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.files.run_folder import (
     RunFolder,
     RunFolderError,
     check_same_config,
@@ -24,13 +22,15 @@ from mjx_balance.run_folder import (
     read_run_config,
     write_json,
 )
+from mjx_balance.policy.file import Policy, PolicyError
+from mjx_balance.report.progress import Display
 from mjx_balance.training import (
     checkpoints,
-    devices,
     finish,
     loop,
     profiling,
     program_cache,
+    sizing,
     validation,
 )
 from mjx_balance.training.checkpoints import CheckpointError
@@ -80,10 +80,10 @@ def train(
     """
     began = time.perf_counter()
     with joined(place, ORDERLY) as processes:
-        devices.configure_jax(display.say)
+        sizing.configure_jax(display.say)
         wanted = config
         config, env, learner = processes.everywhere(lambda: _make(wanted), ConfigError)
-        for line in devices.grown(wanted, config):
+        for line in sizing.grown(wanted, config):
             display.say(line)
         folder = _open_folder(config, provenance(env), run_dir, resume, display.say, processes)
         with _locked(folder, processes), _resumable(folder):
@@ -119,15 +119,15 @@ def _make(config: Config) -> tuple[Config, BalanceEnv, Learner]:
     """The config, sized to the devices, its env and its learner, which fit into the memory."""
     most = None
     while True:
-        sized = devices.size_to_device(check(config), most)
+        sized = sizing.size_to_device(check(config), most)
         finish.check_fits(sized)
         env = BalanceEnv(sized)
-        learner = devices.make_learner(sized, env)
+        learner = sizing.make_learner(sized, env)
         try:
-            devices.check_memory(learner)
+            sizing.check_memory(learner)
             return sized, env, learner
         except ConfigError:
-            if config.num_envs is not None or learner.num_envs <= devices.CPU_ENVS:
+            if config.num_envs is not None or learner.num_envs <= sizing.CPU_ENVS:
                 raise
             most = learner.num_envs // 2
 
@@ -214,7 +214,7 @@ def _learn(
             # Warp's kernels live in this process; a cache keeps no names to profile by.
             key = None
             if config.engine != "warp" and not profile:
-                key = program_cache.program_key(config, plan.iterations, devices.__name__)
+                key = program_cache.program_key(config, plan.iterations, sizing.__name__)
             if profile:
                 jax.config.update("jax_enable_compilation_cache", False)
             program = stop.run(program_cache.compile_program, program, state, key, display.say)

@@ -16,8 +16,10 @@ import numpy as np
 from mjx_balance.config import Config, members
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.dqn.updating import Params
-from mjx_balance.evaluation import observing, run_suite, summarize
-from mjx_balance.policy import (
+from mjx_balance.evaluation.rollout import observing, run_suite, summarize
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.policy.file import (
     Policy,
     PolicyError,
     flat_weights,
@@ -25,9 +27,7 @@ from mjx_balance.policy import (
     make_manifest,
     save_policy,
 )
-from mjx_balance.run_folder import RunFolder
-from mjx_balance.scene import Scene
-from mjx_balance.suites import HEADLINE, SEEDS
+from mjx_balance.sim.scene import Scene
 from mjx_balance.training.loop import number
 from mjx_balance.training.program_cache import Say
 

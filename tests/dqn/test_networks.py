@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_balance.dqn import heads
 from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.policy import heads
 
 KEY = jax.random.PRNGKey(0)
 

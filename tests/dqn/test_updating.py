@@ -11,9 +11,9 @@ import probes
 import pytest
 
 from mjx_balance.config import DQNConfig
-from mjx_balance.dqn.heads import Added
 from mjx_balance.dqn.replay import Transition
 from mjx_balance.dqn.updating import loss, make_optimizer, mirrored
+from mjx_balance.policy.heads import Added
 from mjx_balance.task.symmetry import Symmetries
 
 COUNT = 400

@@ -12,9 +12,9 @@ from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config
-from mjx_balance.evaluation import Envelope, Rollout
+from mjx_balance.evaluation.rollout import Envelope, Rollout
 from mjx_balance.report import figures
-from mjx_balance.scene import Scene
+from mjx_balance.sim.scene import Scene
 
 NAMES = (
     "train/tilt_deg",

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjx_balance.evaluation import Envelope, Rollout
-from mjx_balance.policy import Policy, load_policy
+from mjx_balance.evaluation.rollout import Envelope, Rollout
+from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report import measuring
 from mjx_balance.report.measuring import measured
 from mjx_balance.report.reading import FOREIGN
-from mjx_balance.scene import Scene, load_scene
+from mjx_balance.sim.scene import Scene, load_scene
 
 SHIPPED = Path(__file__).parents[2] / "policies" / "best.safetensors"
 NAMES = ("policy", "none", "pd-imu", "pd-attitude", "rate-oracle", "clairvoyant")

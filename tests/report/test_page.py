@@ -21,13 +21,13 @@ from made_up import evaluation_result, metrics_line
 
 from mjx_balance.cli import main
 from mjx_balance.config import Config, preset, to_dict
-from mjx_balance.evaluation import Envelope
-from mjx_balance.policy import Policy, load_policy, make_manifest, save_policy
-from mjx_balance.render import RenderError
+from mjx_balance.evaluation.rollout import Envelope
+from mjx_balance.policy.file import Policy, load_policy, make_manifest, save_policy
+from mjx_balance.render.drawing import RenderError
 from mjx_balance.report import figures, measuring, page, reading
 from mjx_balance.report.measuring import Measured
 from mjx_balance.report.reading import Run
-from mjx_balance.scene import Scene
+from mjx_balance.sim.scene import Scene
 
 ISOLATED = '"network_isolation_key":"file://'
 """How Chromium's network log marks what a page from disk asks for."""

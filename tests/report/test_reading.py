@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_up import evaluation_result, metrics_line
 
-from mjx_balance import run_folder
 from mjx_balance.config import preset, to_dict
+from mjx_balance.files import run_folder
 from mjx_balance.report import page, reading
 from mjx_balance.report.reading import ReportError
 

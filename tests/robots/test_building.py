@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import Config, ConfigError, check, fitted, preset
-from mjx_balance.controllers import make_controller, measure_response
-from mjx_balance.evaluation import run_suite
-from mjx_balance.robots import (
+from mjx_balance.evaluation.controllers import make_controller, measure_response
+from mjx_balance.evaluation.rollout import run_suite
+from mjx_balance.robots.build import scene_dir
+from mjx_balance.robots.catalogue import (
     Robot,
     RobotError,
     find_robot,
@@ -22,9 +23,8 @@ from mjx_balance.robots import (
     robot_xml,
     shipped,
 )
-from mjx_balance.robots.building import scene_dir
 from mjx_balance.robots.draft import draft
-from mjx_balance.scene import ROBOT, Scene, load_scene
+from mjx_balance.sim.scene import ROBOT, Scene, load_scene
 from mjx_balance.task.kinematics import foot_heights, joint_angles
 
 MAKERS = tuple(name for name in shipped() if name != "quadruped")
@@ -307,7 +307,7 @@ def test_a_board_that_is_too_small(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [*MAKERS, "quadruped"])
 def test_feet_hold_as_well_as_ours(name: str) -> None:
     """Regularised friction lets every robot creep; a light body for a foot, twice as fast."""
-    from mjx_balance.inspection import tilted
+    from mjx_balance.cli.inspection import tilted
 
     assert tilted(scene_of(name)).creep < 0.005
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import check, fitted, preset
-from mjx_balance.robots import Robot, RobotError, find_robot, shipped
-from mjx_balance.robots.building import build, model_path
+from mjx_balance.robots.build import build, model_path
+from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, shipped
 from mjx_balance.robots.draft import draft
-from mjx_balance.robots.file import parse_robot_file
-from mjx_balance.scene import load_scene
+from mjx_balance.robots.schema import parse_robot_file
+from mjx_balance.sim.scene import load_scene
 
 MAKERS = tuple(name for name in shipped() if name != "quadruped")
 

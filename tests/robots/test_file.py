@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from mjx_balance.robots import SHIPPED, RobotError, find_robot, robot_file, shipped
-from mjx_balance.robots.file import Foot, LegFile, RobotFile, read_robot_file
+from mjx_balance.robots.catalogue import SHIPPED, RobotError, find_robot, robot_file, shipped
+from mjx_balance.robots.schema import Foot, LegFile, RobotFile, read_robot_file
 
 TEXT = """
 model = "rex.xml"
@@ -131,6 +131,6 @@ def test_shipped_files_name_their_source_and_are_short() -> None:
 def test_a_robot_is_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The numbers are asked for everywhere; a mesh takes a second to read."""
     first = find_robot("quadruped")
-    monkeypatch.setattr("mjx_balance.robots.build", None)
+    monkeypatch.setattr("mjx_balance.robots.catalogue.build", None)
     assert find_robot("quadruped") is first
     assert robot_file("quadruped").name == "quadruped"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import fitted, preset
-from mjx_balance.env import BalanceEnv
+from mjx_balance.envs.balance import BalanceEnv
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "many_robots.py"
 ROBOTS = ("go1", "quadruped")

@@ -17,7 +17,7 @@ import pytest
 from fleet import walked
 
 from mjx_balance.config import Config, TaskConfig
-from mjx_balance.robots import Robot
+from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import decision
 from mjx_balance.task.tilt import Scenario
 

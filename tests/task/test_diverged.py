@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import Config
-from mjx_balance.robots import Robot
-from mjx_balance.scene import Scene
+from mjx_balance.robots.catalogue import Robot
+from mjx_balance.sim.scene import Scene
 from mjx_balance.task import decision, kinematics
 
 BAD = (float("nan"), float("inf"), -float("inf"), 3e38)

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.robots import Robot
-from mjx_balance.scene import ROBOT, Scene
+from mjx_balance.robots.catalogue import Robot
+from mjx_balance.sim.scene import ROBOT, Scene
 from mjx_balance.task.kinematics import foot_heights, joint_angles, ramp
 
 LINKS = ((0.213, 0.213), (0.213, 0.19), (0.18, 0.23))

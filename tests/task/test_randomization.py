@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjx_balance.config import RandomizationConfig
-from mjx_balance.robots import Robot
+from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
 
 RANDOM = RandomizationConfig(

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import Config
-from mjx_balance.controllers import View
-from mjx_balance.evaluation import Rollout, roll_out
-from mjx_balance.robots import Robot
-from mjx_balance.scene import Scene
-from mjx_balance.suites import make_scenarios
+from mjx_balance.evaluation.controllers import View
+from mjx_balance.evaluation.rollout import Rollout, roll_out
+from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.robots.catalogue import Robot
+from mjx_balance.sim.scene import Scene
 from mjx_balance.task.actions import action_table, apply_action
 from mjx_balance.task.observation import observation_names
 from mjx_balance.task.randomization import Conditions

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mjx_balance.config import preset
 from mjx_balance.dqn.networks import QNetwork
-from mjx_balance.robots import find_robot
+from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.task.observation import observation_names
 
 CONFIG = preset("smoke")

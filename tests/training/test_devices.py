@@ -15,9 +15,9 @@ from jax.sharding import PartitionSpec
 from mjx_balance.config import ConfigError, preset
 from mjx_balance.dqn.devices import AXIS
 from mjx_balance.dqn.learner import REPLICATED
-from mjx_balance.env import BalanceEnv
-from mjx_balance.training import devices, program_cache, run
-from mjx_balance.training.devices import check_memory, explained, make_learner, size_to_device
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.training import program_cache, run, sizing
+from mjx_balance.training.sizing import check_memory, explained, make_learner, size_to_device
 
 CONFIG = preset("default")
 
@@ -54,12 +54,12 @@ def test_an_accelerator_gets_2048_envs_and_eight_times_of_what_is_counted_in_the
     assert dqn.updates_per_step(2048) == CONFIG.dqn.updates_per_step(256) == 32
     same = dataclasses.replace(
         sized,
-        **{name: getattr(CONFIG, name) for name in (*devices.COUNTED_IN_ENVS, "num_devices")},
+        **{name: getattr(CONFIG, name) for name in (*sizing.COUNTED_IN_ENVS, "num_devices")},
         num_envs=None,
         dqn=CONFIG.dqn,
     )
     assert same == CONFIG, "nothing else"
-    assert devices.grown(CONFIG, sized) == [
+    assert sizing.grown(CONFIG, sized) == [
         "with num_envs 2,048 come num_env_steps 320,000, log_every 8,192, eval_every 160,000, "
         "batch_size 2,048, replay_capacity 1,048,576, min_replay_size 8,192, "
         "epsilon_decay_steps 40,000, whiten_steps 400,000; what you say stays"
@@ -76,21 +76,21 @@ def test_what_the_user_says_is_not_grown() -> None:
     assert sized.dqn.updates_per_step(2048) == 64
     with_envs = dataclasses.replace(CONFIG, num_envs=2_048)
     assert size_to_device(with_envs) == dataclasses.replace(with_envs, num_devices=1)
-    assert devices.grown(with_envs, size_to_device(with_envs)) == []
+    assert sizing.grown(with_envs, size_to_device(with_envs)) == []
 
 
 @pytest.mark.usefixtures("on_h100")
 def test_a_measured_device_gets_the_fewest_envs_that_come_near_the_best() -> None:
     """Of the engine that was measured; what is damaged counts as nothing."""
     rates = {256: 0.5e6, 1_024: 1.9e6, 4_096: 4.6e6, 8_192: 4.9e6, 32_768: 5.0e6}
-    assert devices.remember_envs("mjx", rates) == 4_096
-    assert devices.remember_envs("warp", {256: 1e6}) == 256
+    assert sizing.remember_envs("mjx", rates) == 4_096
+    assert sizing.remember_envs("warp", {256: 1e6}) == 256
     assert size_to_device(CONFIG).num_envs == 4_096
     assert size_to_device(dataclasses.replace(CONFIG, engine="warp")).num_envs == 256
     for text in ("{", "[]", '{"NVIDIA H100, engine mjx": "many"}'):
         (program_cache.cache_dir() / "sizes.json").write_text(text)
         assert size_to_device(CONFIG).num_envs == 2_048
-        assert devices.remember_envs("warp", {1_024: 1e6}) == 1_024
+        assert sizing.remember_envs("warp", {1_024: 1e6}) == 1_024
         assert size_to_device(dataclasses.replace(CONFIG, engine="warp")).num_envs == 1_024
 
 
@@ -98,7 +98,7 @@ def test_a_cpu_is_not_sized_by_a_measurement(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("MJX_BALANCE_CACHE", str(tmp_path))
-    devices.remember_envs("mjx", {8_192: 1.0})
+    sizing.remember_envs("mjx", {8_192: 1.0})
     assert size_to_device(CONFIG).num_envs == 256
 
 
@@ -221,8 +221,8 @@ def gpu(limit: int | None) -> Any:
 @pytest.fixture
 def needs(monkeypatch: pytest.MonkeyPatch) -> None:
     """100 MiB of libraries, and 1 MiB per env and device."""
-    monkeypatch.setattr(devices, "PROGRAM_BYTES", 100 * MIB)
-    monkeypatch.setattr(devices, "ENV_BYTES", MIB)
+    monkeypatch.setattr(sizing, "PROGRAM_BYTES", 100 * MIB)
+    monkeypatch.setattr(sizing, "ENV_BYTES", MIB)
 
 
 @pytest.mark.usefixtures("needs")
@@ -275,13 +275,13 @@ def test_envs_that_nobody_asked_for_are_halved_until_they_fit(
         if learner.num_envs > 300:
             raise ConfigError("too much")
 
-    monkeypatch.setattr(devices, "make_learner", lambda config, env: config)
-    monkeypatch.setattr(devices, "check_memory", check)
+    monkeypatch.setattr(sizing, "make_learner", lambda config, env: config)
+    monkeypatch.setattr(sizing, "check_memory", check)
     sized, *_ = run._make(CONFIG)
     assert (sized.num_envs, sized.num_env_steps, sized.dqn.batch_size) == (256, 40_000, 256)
     with pytest.raises(ConfigError, match="too much"):
         run._make(dataclasses.replace(CONFIG, num_envs=512))
-    monkeypatch.setattr(devices, "CPU_ENVS", 512)
+    monkeypatch.setattr(sizing, "CPU_ENVS", 512)
     with pytest.raises(ConfigError, match="too much"):
         run._make(CONFIG)
 

@@ -22,7 +22,7 @@ from mujoco import mjx
 from runs import end, start, wait
 
 from mjx_balance import BalanceEnv, load_policy
-from mjx_balance.run_folder import RunFolder
+from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.training.checkpoints import saved_steps
 
 Process: TypeAlias = subprocess.Popen[str]

@@ -14,10 +14,10 @@ from tensorboardX.proto.event_pb2 import Event
 
 from mjx_balance import load_policy
 from mjx_balance.config import ConfigError
-from mjx_balance.display import Display
-from mjx_balance.policy import Policy, PolicyError
-from mjx_balance.run_folder import RunFolder
-from mjx_balance.suites import SEEDS
+from mjx_balance.evaluation.suites import SEEDS
+from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.policy.file import Policy, PolicyError
+from mjx_balance.report.progress import Display
 from mjx_balance.training import finish
 
 

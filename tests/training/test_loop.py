@@ -23,8 +23,8 @@ from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event
 
 from mjx_balance.config import PRESETS, Config, TaskConfig
-from mjx_balance.display import Display
-from mjx_balance.run_folder import RunFolder
+from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints, loop
 from mjx_balance.training import run as run_module
 from mjx_balance.training.loop import Interrupts, Plan, learn, make_plan, measured
@@ -640,7 +640,7 @@ def test_a_run_begins_at_its_newest_checkpoint(
     checkpoints.save(folder.checkpoints, 3_072, third)
     assert float(go_on().weights) == 201  # one call from the newest, 2 * 100 + 1
     assert learner.seeds == [5]
-    assert compiled == [program_key(sized, 16, "mjx_balance.training.devices")]
+    assert compiled == [program_key(sized, 16, "mjx_balance.training.sizing")]
     assert "resuming at 3,072 decisions" in display.console.file.getvalue()  # pyright: ignore
     assert float(go_on().weights) == 201
     assert len(compiled) == 1, "a complete run needs no program"

@@ -14,15 +14,15 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_balance.config import Config, flatten, preset, to_dict
-from mjx_balance.sources import code
-from mjx_balance.training import devices, program_cache
+from mjx_balance.files.sources import code
+from mjx_balance.training import program_cache, sizing
 from mjx_balance.training.program_cache import (
     NOT_TRACED,
     compile_program,
     program_key,
 )
 
-ROOT = devices.__name__
+ROOT = sizing.__name__
 CONFIG = preset("smoke")
 
 

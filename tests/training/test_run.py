@@ -12,7 +12,7 @@ import pytest
 from runs import end, interrupt, start
 
 from mjx_balance import load_policy
-from mjx_balance.run_folder import RunFolder
+from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.training.checkpoints import saved_steps
 
 FLAGS = (

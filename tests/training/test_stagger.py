@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from fleet import ENVS, EPISODE, Fleet
 
-from mjx_balance.training.devices import make_learner, size_to_device
+from mjx_balance.training.sizing import make_learner, size_to_device
 
 
 def test_first_episodes_are_of_every_length(fleet: Fleet) -> None:

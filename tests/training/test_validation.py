@@ -15,13 +15,14 @@ from brax.envs.base import State
 from rich.console import Console
 from stub_learner import CONFIG, OBS, PARAMS, SEED, Learner, state_of
 
-from mjx_balance import evaluation, load_policy
+from mjx_balance import load_policy
 from mjx_balance.dqn.learner import Learner as RealLearner
 from mjx_balance.dqn.networks import QNetwork
-from mjx_balance.policy import make_manifest, save_policy
-from mjx_balance.run_folder import RunFolder
-from mjx_balance.scene import Scene
-from mjx_balance.suites import SEEDS
+from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.evaluation.suites import SEEDS
+from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.policy.file import make_manifest, save_policy
+from mjx_balance.sim.scene import Scene
 from mjx_balance.training import finish, loop
 from mjx_balance.training.loop import Interrupts
 from mjx_balance.training.validation import best_validated, scalars, score, validate

@@ -1,0 +1,183 @@
+"""What `mjx-balance robot check` says of a robot: built, stood on the board, tilted. No JAX."""
+
+import itertools
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from mjx_balance.config import Config, check, fitted, greatest_incline, preset
+from mjx_balance.evaluation.suites import authority
+from mjx_balance.robots.catalogue import Robot
+from mjx_balance.robots.measure import UNLIMITED
+from mjx_balance.sim.scene import Scene, load_scene
+from mjx_balance.task.attitude import body_tilt
+from mjx_balance.task.kinematics import joint_angles
+
+MOST_CREEP = 0.01
+"""Of a robot that stands still, m/s."""
+SPENT = 0.99
+"""Share of its torque from which a servo has none left."""
+MOVING, WAITING = 3.0, 1.0
+"""Time to turn the board, and to watch the robot at rest then, s."""
+
+
+class Tilted(NamedTuple):
+    """A robot that its legs keep level on a board held at the greatest incline on both axes.
+
+    The worst of four: the board turned either way about each axis.
+    """
+
+    torque_share: np.ndarray
+    """(legs, 3) of each servo's limit that it takes at most."""
+    tilt: float
+    """Of the body at the end, at most, deg."""
+    creep: float
+    """What the trunk moves by meanwhile, at most, m/s: regularised friction gives way."""
+    qpos: np.ndarray
+    """(nq,) at the end, where a servo has most to do."""
+
+
+def find_out(robot: str) -> tuple[Scene, Tilted]:
+    """Builds a robot's scene and tilts it.
+
+    Args:
+      robot: as `config.robot`.
+
+    Raises:
+      ConfigError: if it cannot be built, or does not stand.
+    """
+    config = check(fitted(preset("default"), robot))
+    scene = load_scene(config)
+    return scene, tilted(scene)
+
+
+def tilted(scene: Scene) -> Tilted:
+    """Turns the board to `max_incline` on both axes, the body kept level by geometry alone."""
+    found = [_tilted(scene, np.asarray(ways)) for ways in itertools.product((1, -1), repeat=2)]
+    return Tilted(
+        torque_share=np.max([one.torque_share for one in found], axis=0),
+        tilt=max(one.tilt for one in found),
+        creep=max(one.creep for one in found),
+        qpos=max(found, key=lambda one: one.torque_share.max().round(3)).qpos,
+    )
+
+
+def _tilted(scene: Scene, ways: np.ndarray) -> Tilted:
+    """With the board turned one way, (2,) +-1 about its X and Y."""
+    model, task, robot = scene.model, scene.config.task, scene.robot
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = scene.stance.qpos, scene.stance.qvel
+    slope = math.tan(math.radians(task.max_incline))
+    rise = slope * (ways[0] * robot.each("y") - ways[1] * robot.each("x"))
+    steps = round(MOVING / task.sim_dt)
+    angle = math.radians(task.max_incline)
+    root = scene.trunk_quat[0] - 3
+    rested = data.qpos[root : root + 3].copy()
+    for k in range(steps + round(WAITING / task.sim_dt)):
+        share = min(1.0, (k + 1) / steps)
+        data.ctrl[scene.board_ctrl] = share * angle * ways
+        heights = task.body_height - share * rise
+        data.ctrl[scene.leg_ctrl] = joint_angles(robot, heights) + scene.stance.leg_trim
+        mujoco.mj_step(model, data)
+        if k == steps:
+            rested = data.qpos[root : root + 3].copy()
+    limits = model.actuator_forcerange[scene.leg_ctrl, 1]
+    return Tilted(
+        torque_share=np.abs(data.actuator_force[scene.leg_ctrl]) / limits,
+        tilt=float(body_tilt(data.qpos[scene.trunk_quat])),
+        creep=float(np.linalg.norm(data.qpos[root : root + 3] - rested)) / WAITING,
+        qpos=data.qpos.copy(),
+    )
+
+
+def shortcomings(scene: Scene, at_tilt: Tilted) -> list[str]:
+    """Why it is not ready to be trained, a sentence each; empty if it is."""
+    task, found = scene.config.task, []
+    if at_tilt.tilt > task.fail_tilt:
+        found.append(
+            f"robot {scene.robot.name} does not hold itself level at {task.max_incline:g} deg on "
+            f"both axes: its body tilts to {at_tilt.tilt:.1f} deg, and {task.fail_tilt:g} is a fall"
+        )
+    joint, share = _most_loaded(scene, at_tilt)
+    if share >= SPENT:
+        found.append(
+            f"robot {scene.robot.name} has no torque left at {task.max_incline:g} deg on both "
+            f"axes: {joint!r} takes {100 * share:.0f}% of its own"
+        )
+    return found
+
+
+def _most_loaded(scene: Scene, at_tilt: Tilted) -> tuple[str, float]:
+    """The servo, and the share of its torque that it takes; of mirror images, the first."""
+    leg, joint = np.unravel_index(np.argmax(at_tilt.torque_share.round(3)), (4, 3))
+    return scene.robot.legs[leg].joints[joint], float(at_tilt.torque_share.max())
+
+
+def described(scene: Scene, at_tilt: Tilted) -> list[str]:
+    """What was found, line by line."""
+    robot, config = scene.robot, scene.config
+    low, high = robot.height_range
+    lines = [
+        f"{robot.name}: {robot.total_mass:.2f} kg, of which the trunk {robot.trunk_mass:.2f}",
+        f"stands at {_mm(config.task.body_height)}; its legs reach from {_mm(low)} to {_mm(high)}",
+        f"servos {robot.servo_stiffness:g} N m/rad, {robot.servo_damping:g} N m s/rad; limits "
+        f"{_limit(robot.hip_torque)} (abduction, hip), {_limit(robot.knee_torque)} (knee)",
+        "",
+        *_legs(robot),
+        "",
+        *_abilities(config, robot),
+        *_standing(scene, at_tilt),
+    ]
+    return lines
+
+
+def _legs(robot: Robot) -> list[str]:
+    lines = []
+    for leg in robot.legs:
+        place = f"{'front' if leg.front else 'hind'} {'left' if leg.left else 'right'}"
+        ahead, side = "ahead" if leg.x > 0 else "behind", "left" if leg.y > 0 else "right"
+        turns = " ".join(
+            ("+" if sign > 0 else "-") + joint
+            for sign, joint in zip(leg.signs, leg.joints, strict=True)
+        )
+        bend = "backward" if sum(leg.knee) < 0 else "forward"
+        lines.append(
+            f"{leg.name:>4}  {place:<10}  foot {_mm(abs(leg.x))} {ahead}, {_mm(abs(leg.y))} to the "
+            f"{side}; thigh {_mm(leg.thigh)}, calf {_mm(leg.calf)}; knee {bend}; {turns}"
+        )
+    return lines
+
+
+def _abilities(config: Config, robot: Robot) -> list[str]:
+    able, reach = authority(config), greatest_incline(config.task, robot)
+    task = config.task
+    return [
+        f"height changes up to {1000 * task.action_max:.2f} mm follow {able:.2f} deg/s, "
+        f"{able / task.board_rate:.2f} of the board's {task.board_rate:g}",
+        f"the legs follow {reach:.1f} deg on both axes at once; the board tilts to "
+        f"{task.max_incline:g}",
+    ]
+
+
+def _standing(scene: Scene, at_tilt: Tilted) -> list[str]:
+    joint, share = _most_loaded(scene, at_tilt)
+    unlimited = UNLIMITED in (scene.robot.hip_torque, scene.robot.knee_torque)
+    slow = at_tilt.creep < MOST_CREEP
+    still = "stands still" if slow else f"slides by {1000 * at_tilt.creep:.0f} mm/s"
+    incline = scene.config.task.max_incline
+    loaded = f"the most loaded servo, {joint}, takes {100 * share:.0f}% of its torque"
+    if unlimited:
+        loaded = "its model limits no torque: say hip_torque and knee_torque, in N m"
+    return [
+        f"at {incline:g} deg on both axes it {still}, level to {at_tilt.tilt:.2f} deg; {loaded}",
+    ]
+
+
+def _limit(torque: float) -> str:
+    return "none" if torque == UNLIMITED else f"{torque:g} N m"
+
+
+def _mm(metres: float) -> str:
+    return f"{1000 * metres:.0f} mm"

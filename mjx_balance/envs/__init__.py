@@ -1,0 +1,1 @@
+"""The task as an environment: brax, NumPy, Gymnasium."""

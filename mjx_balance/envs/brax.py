@@ -1,0 +1,80 @@
+"""What brax's trainers need to train `BalanceEnv`: `ppo.train(env, wrap_env_fn=wrap, ...)`.
+
+brax's own wrapping starts an episode again with its first physics and observation and leaves
+`info` alone. Physics and observation of a settled robot are the same in all of our episodes,
+but scenario, memories, circumstances and clock live in `info`: after a fall the legs would jump
+to where they fell, on a board that is already tilted, and from the time limit on every
+step would end an episode.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State, Wrapper
+from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper, VmapWrapper
+
+from mjx_balance.envs.balance import BalanceEnv
+
+
+def wrap(
+    env: BalanceEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None
+) -> Wrapper:
+    """As `brax.envs.training.wrap`, but that every episode is a new scenario.
+
+    Args:
+      env: one board.
+      episode_length: decisions until brax cuts an episode off; at most the env's own.
+      action_repeat: decisions that take the same action.
+      randomization_fn: none; circumstances are drawn as the env's config says.
+
+    Raises:
+      ValueError: for a longer episode, or a randomization_fn.
+    """
+    longest = env.config.task.episode_length
+    if episode_length > longest:
+        raise ValueError(f"episode_length is {episode_length}; scenarios end after {longest}")
+    if randomization_fn is not None:
+        raise ValueError("randomization_fn is given; BalanceEnv randomises by its config instead")
+    return _NewScenarios(EpisodeWrapper(VmapWrapper(_Endless(env)), episode_length, action_repeat))
+
+
+class _Endless(Wrapper):
+    """Leaves the time limit to brax, which takes any other end for a failure."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        after = self.env.step(state, action)
+        return after.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            done=after.done * (1 - after.info["truncation"])
+        )
+
+
+class _NewScenarios(AutoResetWrapper):
+    """brax's automatic reset, and that of the env's own part of `info`, from a fresh key."""
+
+    def __init__(self, env: Env):
+        super().__init__(env)
+        key = jax.eval_shape(lambda: jax.random.PRNGKey(0))
+        start = jax.eval_shape(env.unwrapped.reset, key)
+        self._own = sorted(start.info.keys() - {"truncation"})
+
+    def reset(self, rng: jax.Array) -> State:
+        """Starts episodes from keys (n, 2)."""
+        rng, following = jnp.moveaxis(jax.vmap(jax.random.split)(rng), 1, 0)
+        state = super().reset(rng)
+        state.info["next_key"] = following
+        return state
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Takes one decision of every env; `obs` of one that is over is the next episode's."""
+        after = super().step(state, action)
+        start = self.reset(after.info["next_key"])
+
+        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(after.done.reshape(-1, *[1] * (old.ndim - 1)) > 0, new, old)
+
+        renewed = (*self._own, "next_key")
+        new, old = ({name: info[name] for name in renewed} for info in (start.info, after.info))
+        return after.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            info=after.info | jax.tree.map(choose, new, old)
+        )

@@ -1,0 +1,1 @@
+"""Suites, controllers and rollouts in plain MuJoCo."""

@@ -1,0 +1,275 @@
+"""Who acts: what a controller sees, and classical ones to measure a policy against. No JAX.
+
+The baselines act through the policy's own action set. `pd-imu` sees what the policy
+sees. The others cheat, each with more knowledge, and bound what any controller can do
+with these actions at this rate.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from mjx_balance.config import ACTION_AXES
+from mjx_balance.errors import InputError
+from mjx_balance.sim.scene import Scene
+from mjx_balance.task import decision, tilt
+from mjx_balance.task.actions import nearest_action
+from mjx_balance.task.attitude import roll_pitch
+
+HORIZON = 8
+"""Decisions that the predictive controllers look ahead."""
+SWEEPS = 25
+"""Rounds of coordinate descent of the predictive controllers."""
+
+
+class View(NamedTuple):
+    """All there is to see when n scenarios of an evaluation take a decision.
+
+    A policy looks at `obs` alone; baselines may look at what no robot knows.
+    """
+
+    ids: np.ndarray
+    """(n,) numbers of these scenarios in the batch, for controllers with a memory."""
+    decision: int
+    """Decisions since the start."""
+    obs: np.ndarray
+    """(n, obs_size) the network's input."""
+    imu: np.ndarray
+    """(n, sim_steps, 6) IMU samples of the last decision."""
+    qpos: np.ndarray
+    """(n, nq) true positions."""
+    qvel: np.ndarray
+    """(n, nv) true velocities."""
+    scenario: tilt.Scenario
+    """Where the boards go."""
+    late: np.ndarray
+    """(n,) whether actions are taken one decision late."""
+
+
+Controller = Callable[[View], np.ndarray]
+"""Maps what there is to see of n scenarios to action indices (n,), or to a_x and a_y (n, 2), m."""
+
+
+class ControllerError(InputError):
+    """An unknown controller; the message lists the known ones."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Response:
+    """What one action does to the body, measured in the simulator once."""
+
+    gain: np.ndarray
+    """(2,) change of roll and pitch per height change a_x, a_y, deg/m, in the end."""
+    course: np.ndarray
+    """(2, HORIZON * sim_steps) share of it reached after each physics step."""
+
+
+def measure_response(scene: Scene) -> Response:
+    """Takes one action on each axis, on the level board, and watches the body."""
+    task, robot = scene.config.task, scene.robot
+    size = task.action_max / 2
+    gains, courses = [], []
+    level = tilt.Scenario(np.zeros((1, 2)), np.zeros(()), np.asarray(task.board_rate))
+    for axis in range(ACTION_AXES):
+        data = mujoco.MjData(scene.model)
+        data.qpos, data.qvel = scene.stance.qpos, scene.stance.qvel
+        memory = decision.start(task, robot, scene.stance.imu)
+        change = size * np.eye(ACTION_AXES)[axis]
+        angles = []
+        for number in range(HORIZON):
+            now = np.asarray(float(number))
+            memory, targets = decision.controls(task, robot, memory, change, None, level, now)
+            for ctrl in scene.ctrl(targets):
+                data.ctrl = ctrl
+                mujoco.mj_step(scene.model, data)
+                angles.append(roll_pitch(data.qpos[scene.trunk_quat])[axis])
+            change = 0 * change
+        gains.append(angles[-1] / size)
+        courses.append(np.asarray(angles) / angles[-1])
+    return Response(np.asarray(gains), np.asarray(courses))
+
+
+def attitude(scene: Scene, view: View) -> np.ndarray:
+    """(n, 2) true roll and pitch of the body, deg."""
+    return np.stack(roll_pitch(view.qpos[:, scene.trunk_quat]), axis=-1)
+
+
+class Stand:
+    """Never moves."""
+
+    def __init__(self, scene: Scene):
+        """Needs the action set only."""
+        self.action = nearest_action(scene.config.task, np.zeros(ACTION_AXES))
+
+    def __call__(self, view: View) -> np.ndarray:
+        """Returns action indices (n,)."""
+        return np.full(len(view.ids), self.action)
+
+
+class AttitudePD:
+    """Proportional and derivative control on the true attitude and angular rate."""
+
+    def __init__(self, scene: Scene, proportional: float = 1.3, rate: float = 0.12):
+        """Takes the gains.
+
+        Args:
+          scene: task and addresses.
+          proportional: share of the tilt undone by one decision (benchmarks/baselines.py).
+          rate: time for which the present rate is undone beforehand, s (same).
+        """
+        self.scene, self.task = scene, scene.config.task
+        self.proportional, self.rate = proportional, rate
+        self.gain = measure_response(scene).gain
+
+    def __call__(self, view: View) -> np.ndarray:
+        """Returns action indices (n,)."""
+        angle, speed = self.state(view)
+        wanted = -(self.proportional * angle + self.rate * speed) / self.gain
+        return nearest_action(self.task, wanted)
+
+    def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Roll and pitch (n, 2), deg, and their rates (n, 2), deg/s."""
+        joint = np.flatnonzero(self.scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)[0]
+        turn = self.scene.model.jnt_dofadr[joint] + 3
+        return attitude(self.scene, view), np.degrees(view.qvel[:, turn : turn + 2])
+
+
+class ImuPD(AttitudePD):
+    """The same control on the attitude that a complementary filter reads off the IMU.
+
+    The filter integrates the gyro and leans toward the accelerometer's tilt with a time
+    constant (Mahony et al. 2008, https://hal.science/hal-00488376, section III, with
+    fixed gain and no bias): angle += dt * gyro, then
+    angle += dt / (tau + dt) * (tilt_accel - angle).
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        proportional: float = 1.2,
+        rate: float = 0.14,
+        tau: float = 4.0,
+        samples: int = 1,
+    ):
+        """Takes the gains; `tau` in s, and the gyro samples averaged for the rate."""
+        super().__init__(scene, proportional, rate)
+        self.tau, self.samples = tau, samples
+        self.angle = np.zeros((0, ACTION_AXES))
+
+    def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Filters the last decision's samples; see `AttitudePD.state`."""
+        if view.decision == 0:
+            self.angle = np.zeros((view.ids.max() + 1, ACTION_AXES))
+        gyro, accel = view.imu[..., :2], view.imu[..., 3:]
+        lean = np.arctan2(accel[..., 1], accel[..., 2])
+        nod = np.arctan2(-accel[..., 0], np.hypot(accel[..., 1], accel[..., 2]))
+        by_gravity = np.stack((lean, nod), axis=-1)
+        dt = self.task.sim_dt
+        leak = dt / (self.tau + dt)
+        weight = (1 - leak) ** np.arange(view.imu.shape[1])[::-1, None]
+        steps = dt * (1 - leak) * gyro + leak * by_gravity
+        old = self.angle[view.ids] * (1 - leak) ** view.imu.shape[1]
+        self.angle[view.ids] = old + (weight * steps).sum(axis=1)
+        rate = gyro[:, -self.samples :].mean(axis=1)
+        return np.degrees(self.angle[view.ids]), np.degrees(rate)
+
+
+class Predictive:
+    """Model predictive control on true attitude, response, latency and a forecast of the board.
+
+    Minimises the squared tilt over every physics step of the next `HORIZON` decisions,
+    within the action limits, takes the first action that is still open and plans again.
+    """
+
+    def __init__(self, scene: Scene, forecast: Callable[..., np.ndarray]):
+        """Prepares the quadratic programme.
+
+        Args:
+          scene: task and addresses.
+          forecast: (task, scenario, now (n,), ahead (m,)) -> (n, m, 2) change of the
+            board's angles, deg.
+        """
+        self.scene, self.task, self.forecast = scene, scene.config.task, forecast
+        response, steps = measure_response(scene), self.task.sim_steps
+        self.gain = response.gain
+        # effect[axis, j, t]: deg at step t per deg of action j
+        effect = np.zeros((ACTION_AXES, HORIZON, HORIZON * steps))
+        for j in range(HORIZON):
+            effect[:, j, j * steps :] = response.course[:, : (HORIZON - j) * steps]
+        self.effect = effect
+        self.gram = np.einsum("xjt,xkt->xjk", effect, effect)
+        tail = np.ones_like(response.course)
+        tail[:, :-steps] = response.course[:, steps:]
+        self.unfinished = tail - response.course[:, steps - 1 : steps]
+        self.chosen = np.zeros((2, 0, ACTION_AXES))
+
+    def __call__(self, view: View) -> np.ndarray:
+        """Returns action indices (n,)."""
+        task, n = self.task, len(view.ids)
+        if view.decision == 0:
+            self.chosen = np.zeros((2, view.ids.max() + 1, ACTION_AXES))
+        older, newer = self.chosen[:, view.ids]
+        late = view.late[:, None]
+        ahead = task.sim_dt * np.arange(1, HORIZON * task.sim_steps + 1)
+        now = np.full(n, view.decision * task.ctrl_dt)
+        board = self.forecast(task, view.scenario, now, ahead)
+        w, x, y, z = view.qpos[:, self.scene.trunk_quat].T
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))[:, None]
+        board = np.stack(
+            (
+                np.cos(yaw) * board[..., 0] + np.sin(yaw) * board[..., 1],
+                np.cos(yaw) * board[..., 1] - np.sin(yaw) * board[..., 0],
+            ),
+            axis=-1,
+        )
+        free = attitude(self.scene, view)[:, None] + board
+        free = free + np.where(late, older, newer)[:, None] * self.unfinished.T
+        linear = np.einsum("xjt,ntx->nxj", self.effect, free)
+        limit = np.abs(self.gain) * task.action_max
+        plan = np.zeros((n, ACTION_AXES, HORIZON))
+        plan[..., 0] = np.where(late, newer, 0)
+        for _ in range(SWEEPS):
+            for j in range(HORIZON):
+                slope = linear[..., j] + np.einsum("nxk,xk->nx", plan, self.gram[:, j])
+                moved = plan[..., j] - slope / self.gram[:, j, j]
+                fixed = late & (j == 0)
+                plan[..., j] = np.where(fixed, plan[..., j], np.clip(moved, -limit, limit))
+        choice = np.where(late, plan[..., 1], plan[..., 0])
+        self.chosen[:, view.ids] = newer, choice
+        return nearest_action(task, choice / self.gain)
+
+
+def at_this_rate(task, scenario: tilt.Scenario, now: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Forecast of a controller that knows the board's true rate, and no more."""
+    before = np.maximum(now[:, None] + np.asarray((-task.sim_dt, 0.0)), 0)
+    angle = tilt.board_angle(task, scenario, before)
+    rate = (angle[:, 1] - angle[:, 0]) / task.sim_dt
+    return rate[:, None] * ahead[:, None]
+
+
+def as_it_will_be(task, scenario: tilt.Scenario, now: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Forecast of a controller that knows where the board will go."""
+    angle = tilt.board_angle(task, scenario, now[:, None] + np.append(0.0, ahead))
+    return angle[:, 1:] - angle[:, :1]
+
+
+CONTROLLERS: dict[str, Callable[[Scene], Controller]] = {
+    "none": Stand,
+    "pd-imu": ImuPD,
+    "pd-attitude": AttitudePD,
+    "rate-oracle": lambda scene: Predictive(scene, at_this_rate),
+    "clairvoyant": lambda scene: Predictive(scene, as_it_will_be),
+}
+"""By the names of `mjx-balance evaluate --controller`."""
+
+
+def make_controller(name: str, scene: Scene) -> Controller:
+    """Builds the controller called `name`; raises `ControllerError` with the known names."""
+    if name not in CONTROLLERS:
+        raise ControllerError(
+            f"unknown controller {name!r}; known controllers: {', '.join(CONTROLLERS)}"
+        )
+    return CONTROLLERS[name](scene)

@@ -1,0 +1,167 @@
+"""The evaluation suites: which boards and circumstances a controller is tried on."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from mjx_balance.config import Config, RandomizationConfig, greatest_incline, scaled_to
+from mjx_balance.errors import InputError
+from mjx_balance.robots.catalogue import find_robot
+from mjx_balance.task import tilt
+from mjx_balance.task.pushes import Pushes, draw_kicks, kicked_decisions
+from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
+
+
+class SuiteError(InputError):
+    """A suite that does not exist, or does not suit the config; the message says why."""
+
+
+def authority(config: Config) -> float:
+    """Greatest board speed that the action set can follow on both axes, deg/s.
+
+    `action_max` per decision over the longer of the two half-tracks, fore-aft.
+    """
+    robot = find_robot(config.robot)
+    speed = config.task.action_max / config.task.ctrl_dt
+    return math.degrees(speed / robot.lever)
+
+
+def _disc(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """Direction uniform, total tilt uniform up to the incline (paper 3.1)."""
+    return tilt.disc_targets(incline[:, None], uniform[..., 0], uniform[..., 1])
+
+
+def _corner(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """Both axes at full incline at once, signs at random: the paper's declared weakness."""
+    return incline[:, None, None] * np.where(uniform < 0.5, -1.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """A kind of scenario."""
+
+    summary: str
+    randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
+    targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
+    """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg."""
+    fast: bool = False
+    """Board speeds uniform from the config's to the authority limit."""
+    steep: bool = False
+    """Inclines uniform from the config's to the reach of the legs."""
+
+
+SUITES: dict[str, Suite] = {
+    "paper": Suite("targets in any direction, up to max_incline (paper 3.1)"),
+    "corner": Suite("both axes at max_incline at once", targets=_corner),
+    "noise": Suite(
+        "IMU noise of a data sheet on every sample",
+        RandomizationConfig(gyro_noise=0.002, accel_noise=0.023),
+    ),
+    "payload": Suite("0 to 5 kg on the trunk, off its centre", RandomizationConfig(payload=5.0)),
+    "friction": Suite(
+        "foot friction from 0.4 to 1.0", RandomizationConfig(friction_min=0.4, friction_max=1.0)
+    ),
+    "gains": Suite("servo gains off by up to 20%", RandomizationConfig(gain_spread=0.2)),
+    "latency": Suite("every action one decision late", RandomizationConfig(latency_share=1.0)),
+    "push": Suite(
+        "the trunk kicked to 0.2 to 0.4 m/s in any direction, every 5 s",
+        RandomizationConfig(push_min=0.2, push_max=0.4),
+    ),
+    "fast": Suite("board speeds up to what the action set can follow", fast=True),
+    "steep": Suite("inclines up to what the legs can reach", steep=True),
+}
+"""By the names of `mjx-balance evaluate --suite`."""
+
+
+HEADLINE = ("paper", "corner")
+"""Suites of the figures that come first: after training, in reports and tables."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Seeds:
+    """Seeds of scenarios, one per purpose, so that none is used for two.
+
+    Training draws from other generators and sees none of them.
+    """
+
+    final: int = 1_000_000
+    """Evaluation after training."""
+    record: int = 2_000_000
+    """Rollouts drawn as figures."""
+    validation: int = 3_000_000
+    """Choice among several training seeds; never reported."""
+    report: int = 4_000_000
+    """Policy against baselines, in a report."""
+    tuning: int = 5_000_000
+    """Gains of the baselines."""
+    held_out: int = 7_000_000
+    """Published results."""
+
+
+SEEDS = Seeds()
+
+
+def find_suite(name: str) -> Suite:
+    """Returns the suite called `name`; raises `SuiteError` with the known names."""
+    if name not in SUITES:
+        raise SuiteError(f"unknown suite {name!r}; known suites: {', '.join(SUITES)}")
+    return SUITES[name]
+
+
+def check_seed(seed: int) -> None:
+    """Raises `SuiteError` for a seed that nothing can be drawn by."""
+    if seed < 0:
+        raise SuiteError(f"seed is {seed}; it must not be negative")
+
+
+def make_scenarios(
+    config: Config, suite: str, scenarios: int, duration: float, seed: int
+) -> tuple[tilt.Scenario, Conditions]:
+    """Draws a suite's scenarios and the circumstances they happen in.
+
+    Scenario k of a seed is the same however many are drawn.
+
+    Raises:
+      SuiteError: for an unknown suite, a negative seed, or a board that does not arrive
+        before its next target.
+    """
+    chosen, task, robot = find_suite(suite), config.task, find_robot(config.robot)
+    check_seed(seed)
+    count = tilt.num_targets(task, duration)
+    rngs = [np.random.default_rng((seed, k)) for k in range(scenarios)]
+    uniform = np.asarray([rng.uniform(size=(count, 2)) for rng in rngs])
+    others = np.asarray([rng.uniform(size=DRAWS + 2) for rng in rngs])
+    rate, incline = np.full(scenarios, task.board_rate), np.full(scenarios, task.max_incline)
+    if chosen.fast:
+        rate += np.maximum(authority(config) - task.board_rate, 0) * others[:, DRAWS]
+    if chosen.steep:
+        steepest = greatest_incline(task, robot)
+        incline += np.maximum(steepest - task.max_incline, 0) * others[:, DRAWS + 1]
+    longest = float(np.max(2 * incline / rate))
+    if longest > task.target_period:
+        raise SuiteError(
+            f"target_period is {task.target_period} s, but in suite {suite!r} the board may take "
+            f"{longest:.1f} s to its target; the period must not be shorter"
+        )
+    scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
+    ranges = scaled_to(chosen.randomization, robot)
+    return scenario, draw_conditions(ranges, robot, others[:, :DRAWS])
+
+
+def make_pushes(config: Config, suite: str, scenarios: int, duration: float, seed: int) -> Pushes:
+    """Draws a suite's pushes, for the scenarios of the same arguments.
+
+    Those of scenario k of a seed are the same however many are drawn and however long they last:
+    they come from a generator of their own, told by its last number from those that draw the
+    scenario and its noise (evaluation.py).
+
+    Raises:
+      SuiteError: for an unknown suite.
+    """
+    ranges = scaled_to(find_suite(suite).randomization, find_robot(config.robot))
+    at = kicked_decisions(config.task, ranges, duration)
+    rngs = [np.random.default_rng((seed, k, 2)) for k in range(scenarios)]
+    uniform = np.asarray([rng.uniform(size=(len(at), 2)) for rng in rngs])
+    return Pushes(draw_kicks(ranges, uniform), at)

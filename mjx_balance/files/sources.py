@@ -1,0 +1,51 @@
+"""The code of this package that a module consists of: its own, and whatever it imports."""
+
+import ast
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def code(module: str, package: Path = PACKAGE) -> dict[str, str]:
+    """Finds what a module imports of this package, directly or not, wherever it does so.
+
+    Args:
+      module: full dotted name.
+      package: folder of mjx_balance.
+
+    Returns:
+      Module -> its code without comments and docstrings, which decide nothing.
+    """
+    found: dict[str, str] = {}
+    _collect(package, module, found)
+    return found
+
+
+def _collect(package: Path, name: str, found: dict[str, str]) -> None:
+    root, *parts = name.split(".")
+    if root != PACKAGE.name or not parts or name in found:
+        return
+    inside = package.joinpath(*parts)
+    file = inside / "__init__.py" if inside.is_dir() else inside.with_suffix(".py")
+    if not file.is_file():  # a name in a module
+        return
+    tree = _WithoutWords().visit(ast.parse(file.read_text(encoding="utf-8")))
+    found[name] = ast.unparse(tree)
+    targets = [name.rpartition(".")[0]]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            targets += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            targets += [f"{node.module}.{alias.name}" for alias in node.names]
+            targets.append(str(node.module))
+    for target in targets:
+        _collect(package, target, found)
+
+
+class _WithoutWords(ast.NodeTransformer):
+    """Takes docstrings out."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        """Drops strings that stand alone."""
+        words = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if words else node

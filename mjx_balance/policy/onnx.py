@@ -1,0 +1,152 @@
+"""The exported policy as an ONNX model, to run where there is no Python.
+
+The only module that needs the package `onnx` (extra `onnx`). The graph computes what
+`policy.Policy` computes of a batch, operation by operation, so that the two differ in rounding
+alone: the action follows from the network's outputs, as in `dqn/heads.py`, not from a search
+among the values.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from mjx_balance.files.run_folder import write_atomically
+from mjx_balance.policy.file import Policy, installed_version
+from mjx_balance.policy.heads import points
+
+OPSET = 17
+IR_VERSION = 8
+"""What belongs to opset 17; a higher one would shut older runtimes out for nothing."""
+ABOUT = (
+    "Greedy policy of mjx_balance. The metadata's manifest names and scales the observation's "
+    "entries; the action is a row of its actions.table_m."
+)
+
+
+def export_onnx(policy: Policy, path: Path) -> int:
+    """Writes a policy as an ONNX model, whole or not at all.
+
+    Args:
+      policy: of any head.
+      path: where to.
+
+    Returns:
+      Size of the file in bytes.
+
+    Raises:
+      OSError: if it cannot be written; what was there before is then still there.
+    """
+    content = onnx_model(policy).SerializeToString()
+    write_atomically(path, content)
+    return len(content)
+
+
+def onnx_model(policy: Policy) -> onnx.ModelProto:
+    """A policy as an ONNX model that onnx's own checker has passed.
+
+    Input `observation` (N, obs_size) float32; outputs `q_values` (N, num_actions) float32 and
+    `action` (N,) int64, for any N. Its metadata holds the manifest, as JSON. Whatever the
+    observation, not finite ones included, the action is one of the policy's.
+    """
+    graph = _Graph()
+    x = "observation"
+    for kernel, bias in policy.layers[:-1]:
+        x = graph.add("Relu", graph.add("Gemm", x, kernel, bias))
+    if policy.radial:
+        x = graph.add("Concat", x, "observation", axis=1)
+    out = graph.add("Gemm", x, *policy.layers[-1])
+    values, digits = (_radial if policy.radial else _added)(graph, out, policy)
+    strides = [math.prod(policy.factors[k + 1 :]) for k in range(len(policy.factors))]
+    graph.add("Identity", values, output="q_values")
+    index = graph.add("Mul", digits, np.asarray(strides))
+    graph.add("ReduceSum", index, np.asarray([1]), keepdims=0, output="action")
+
+    sizes = {"observation": policy.observation_size, "q_values": len(policy.actions)}
+    floats = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ("N", size))
+        for name, size in sizes.items()
+    ]
+    action = helper.make_tensor_value_info("action", TensorProto.INT64, ("N",))
+    model = helper.make_model(
+        helper.make_graph(graph.nodes, "policy", floats[:1], [floats[1], action], graph.constants),
+        producer_name="mjx_balance",
+        producer_version=installed_version("mjx_balance") or "",
+        doc_string=ABOUT,
+        ir_version=IR_VERSION,
+        opset_imports=[helper.make_opsetid("", OPSET)],
+    )
+    helper.set_model_props(model, {"manifest": json.dumps(policy.manifest)})
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+class _Graph:
+    """Operations and constants, in the order in which they are made."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def add(
+        self,
+        kind: str,
+        *inputs: str | np.ndarray | np.floating,
+        output: str = "",
+        **attributes: Any,
+    ) -> str:
+        """Adds an operation on earlier ones' outputs and on constants; returns its output."""
+        output = output or f"{kind}_{len(self.nodes)}"
+        names = [x if isinstance(x, str) else self._constant(x) for x in inputs]
+        self.nodes.append(helper.make_node(kind, names, [output], output, **attributes))
+        return output
+
+    def columns(self, x: str, start: int, end: int) -> str:
+        """(N, end - start) of x (N, n)."""
+        return self.add("Slice", x, *(np.asarray([k]) for k in (start, end, 1)))
+
+    def _constant(self, value: np.ndarray | np.floating) -> str:
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+
+def _added(graph: _Graph, out: str, policy: Policy) -> tuple[str, str]:
+    """Values of all actions and digits of the best, as `heads.Added`."""
+    ends = np.cumsum(policy.factors)
+    branches = [
+        graph.columns(out, end - levels, end)
+        for levels, end in zip(policy.factors, ends, strict=True)
+    ]
+    best = [graph.add("ArgMax", branch, axis=1) for branch in branches]
+    values, size = branches[0], policy.factors[0]
+    for branch, levels in zip(branches[1:], policy.factors[1:], strict=True):
+        rows = graph.add("Unsqueeze", values, np.asarray([2]))
+        table = graph.add("Add", rows, graph.add("Unsqueeze", branch, np.asarray([1])))
+        size *= levels
+        values = graph.add("Reshape", table, np.asarray([0, size]))
+    return values, graph.add("Concat", *best, axis=1)
+
+
+def _radial(graph: _Graph, out: str, policy: Policy) -> tuple[str, str]:
+    """Values of all actions and digits of the best, as `heads.Radial`."""
+    value = graph.columns(out, 0, 1)
+    mu = graph.columns(out, 1, 1 + len(policy.factors))
+    alpha, beta, kappa, delta = np.logaddexp(policy.profile, np.zeros_like(policy.profile))
+    offset = graph.add("Sub", points(policy.factors), graph.add("Unsqueeze", mu, np.asarray([1])))
+    scaled = graph.add("Mul", offset, np.exp(policy.stretch))
+    squares = graph.add("ReduceSum", graph.add("Mul", scaled, scaled), np.asarray([2]), keepdims=0)
+    z = graph.add("Sqrt", graph.add("Add", squares, delta**2))
+    peak = graph.add("Mul", graph.add("Exp", graph.add("Mul", z, -beta)), alpha)
+    values = graph.add("Sub", graph.add("Add", value, peak), graph.add("Mul", z, kappa))
+
+    zero, last = np.float32(0), np.asarray(policy.factors, np.float32) - 1
+    at = graph.add("Mul", graph.add("Add", mu, np.float32(1)), last / 2)
+    # A cast of NaN is any integer; NumPy's head takes the first point.
+    at = graph.add("Where", graph.add("IsNaN", at), zero, at)
+    nearest = graph.add("Min", graph.add("Max", graph.add("Round", at), zero), last)
+    return values, graph.add("Cast", nearest, to=TensorProto.INT64)

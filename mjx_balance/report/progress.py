@@ -1,0 +1,183 @@
+"""What a person watching a run sees: a live panel in a terminal, plain lines elsewhere."""
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.markup import escape
+from rich.panel import Panel
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from mjx_balance.evaluation.suites import HEADLINE
+
+PLAIN_INTERVAL = 5.0
+"""Seconds between two plain lines."""
+
+SHOWN = {
+    "perf/env_steps_per_second": ("decisions/s", "{:,.0f}"),
+    "train/tilt_deg": ("mean tilt", "{:.3f} deg"),
+    "train/falls_per_minute": ("falls per robot-minute", "{:.3f}"),
+    "train/reward": ("reward", "{:.3f}"),
+    "train/loss": ("loss", "{:.5f}"),
+    "train/epsilon": ("epsilon", "{:.3f}"),
+}
+WARNED = {
+    "train/diverged": ("diverged envs", "{:,.0f}"),
+    "train/skipped_updates": ("skipped updates", "{:.1%}"),
+}
+"""Shown only where there are any."""
+
+
+class Display:
+    """Progress of one run on a console."""
+
+    def __init__(self, console: Console | None = None):
+        """Writes to `console`, standard output if none."""
+        self.console = console or Console()
+        self._metrics: Mapping[str, float] = {}
+        self._progress: Progress | None = None
+        self._total = 0
+
+    def say(self, message: str) -> None:
+        """Prints one line."""
+        self.console.print(message, highlight=False, soft_wrap=True, markup=False)
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Shows a step of unknown length, then how long it took."""
+        began = time.perf_counter()
+        if self.console.is_terminal:
+            with self.console.status(escape(name)):
+                yield
+        else:
+            self.say(f"{name} ...")
+            yield
+        self.say(f"{name}: {time.perf_counter() - began:.1f} s")
+
+    @contextmanager
+    def training(self, done: int, total: int) -> Iterator[None]:
+        """Shows the training; call `update` inside."""
+        self._total, self._last = total, time.perf_counter()
+        self._start, self._done_at_start = self._last, done
+        if not self.console.is_terminal:
+            yield
+            return
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("training"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("decisions"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(elapsed_when_finished=False),
+        )
+        self._task = self._progress.add_task("training", total=total, completed=done)
+        with Live(self._panel(), console=self.console, refresh_per_second=8) as live:
+            self._live = live
+            yield
+        self._progress = None
+
+    def update(self, done: int, metrics: Mapping[str, float]) -> None:
+        """Shows new numbers, and those of the last validation until there is another.
+
+        Args:
+          done: decisions so far.
+          metrics: by their logged names.
+        """
+        held_out = {k: v for k, v in self._metrics.items() if k.startswith("eval/")}
+        self._metrics = {**held_out, **metrics}
+        if self._progress is not None:
+            self._progress.update(self._task, completed=min(done, self._total))
+            self._live.update(self._panel())
+            return
+        now = time.perf_counter()
+        if now - self._last >= PLAIN_INTERVAL or done >= self._total:
+            self._last = now
+            rate = (done - self._done_at_start) / max(now - self._start, 1e-9)
+            left = max(self._total - done, 0) / max(rate, 1e-9)
+            self.say(f"{done:>9,}/{self._total:,} decisions  {self._line()}  left {left:.0f} s")
+
+    @contextmanager
+    def bar(self, name: str) -> Iterator["Bar"]:
+        """A step whose share done is known."""
+        if self.console.is_terminal:
+            columns = (
+                SpinnerColumn(),
+                TextColumn(escape(name)),
+                BarColumn(),
+                TimeRemainingColumn(),
+            )
+            with Progress(*columns, console=self.console, transient=True) as progress:
+                yield Bar(progress)
+        else:
+            self.say(f"{name} ...")
+            yield Bar(None)
+
+    def _line(self) -> str:
+        cells = [
+            f"{label} {text.format(self._metrics[name])}"
+            for name, (label, text) in SHOWN.items()
+            if name in self._metrics
+        ]
+        validated = [f"{label} {value}" for label, value in self._validated()]
+        return "  ".join([*cells, *validated, *self._warnings()])
+
+    def _validated(self) -> list[tuple[str, str]]:
+        """Label and value of each validated suite, once there are any."""
+        found = []
+        for suite in HEADLINE:
+            tilt = self._metrics.get(f"eval/{suite}/tilt_mean")
+            falls = self._metrics.get(f"eval/{suite}/falls")
+            if tilt is not None and falls is not None:
+                found.append((f"held out, {suite}", f"{tilt:.3f} deg, falls {falls:g}"))
+        return found
+
+    def _warnings(self) -> list[str]:
+        """What should not be, where it is."""
+        return [
+            f"{label} {text.format(self._metrics[name])}"
+            for name, (label, text) in WARNED.items()
+            if self._metrics.get(name, 0) > 0
+        ]
+
+    def _panel(self) -> Panel:
+        grid = Table.grid(padding=(0, 3))
+        for _ in range(6):
+            grid.add_column()
+        cells = []
+        for name, (label, text) in SHOWN.items():
+            value = text.format(self._metrics[name]) if name in self._metrics else "-"
+            cells += [f"[dim]{label}[/dim]", f"[bold]{value}[/bold]"]
+        grid.add_row(*cells[:6])
+        grid.add_row(*cells[6:])
+        validated = [f"[dim]{x}[/dim]   [bold]{y}[/bold]" for x, y in self._validated()]
+        below = ["   ".join(validated)] if validated else []
+        below += [f"[bold red]{warning}[/bold red]" for warning in self._warnings()]
+        assert self._progress is not None
+        return Panel(Group(self._progress, grid, *below), title="mjx_balance", border_style="cyan")
+
+
+class Bar:
+    """Takes the share of a step that is done."""
+
+    def __init__(self, progress: Progress | None):
+        """Shows it in `progress`, or nowhere."""
+        self._progress = progress
+        self._task = progress.add_task("", total=1.0) if progress else None
+
+    def __call__(self, share: float) -> None:
+        """Moves the bar to `share`, 0 to 1."""
+        if self._progress is not None and self._task is not None:
+            self._progress.update(self._task, completed=share)

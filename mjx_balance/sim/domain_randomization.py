@@ -1,0 +1,154 @@
+"""What a payload, friction and servo gains change of a compiled model."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_balance.sim.scene import ROBOT, Scene
+from mjx_balance.task import Array
+from mjx_balance.task.randomization import Conditions
+
+
+def model_fields(scene: Scene, conditions: Conditions) -> dict[str, Array]:
+    """The model's fields in given circumstances, for `mjx.Model.replace` or `Batch.expand`.
+
+    The payload is a point mass; its products of inertia about the trunk's principal axes are
+    left out.
+
+    Args:
+      scene: the nominal model.
+      conditions: of one env or scenario, or of a batch (...).
+
+    Returns:
+      Field name -> (..., *shape of the field).
+    """
+    model, xp = scene.model, conditions.payload.__array_namespace__()
+    trunk = model.body(f"{ROBOT}{scene.robot.trunk}").id
+    load, at = conditions.payload[..., None], conditions.payload_at
+    mass, centre = model.body_mass[trunk], model.body_ipos[trunk]
+    moved = (mass * centre + load * at) / (mass + load)
+    arm = (at - centre) @ _principal(model, trunk)
+    spread = xp.sum(arm**2, axis=-1, keepdims=True) - arm**2
+    inertia = model.body_inertia[trunk] + mass * load / (mass + load) * spread
+    gain = conditions.gain[..., None]
+    friction = conditions.friction[..., None, None] * np.ones((model.npair, 2))
+    stiffness = model.actuator_gainprm[scene.leg_ctrl.ravel(), 0] * gain
+
+    def put(field: np.ndarray, where: tuple[Any, ...], value: Array) -> Array:
+        base = xp.zeros((*value.shape[: conditions.payload.ndim], *field.shape)) + field
+        if hasattr(base, "at"):  # JAX arrays are immutable
+            return base.at[(..., *where)].set(value)
+        base[(..., *where)] = value
+        return base
+
+    legs = scene.leg_ctrl.ravel()
+    of_bodies, of_dofs = inverse_weights(scene, (mass + load)[..., 0], moved, inertia)
+    return {
+        "body_mass": put(model.body_mass, (trunk,), (mass + load)[..., 0]),
+        "body_ipos": put(model.body_ipos, (trunk, slice(None)), moved),
+        "body_inertia": put(model.body_inertia, (trunk, slice(None)), inertia),
+        "body_invweight0": of_bodies,
+        "dof_invweight0": of_dofs,
+        "actuator_gainprm": put(model.actuator_gainprm, (legs, 0), stiffness),
+        "actuator_biasprm": put(model.actuator_biasprm, (legs, 1), -stiffness),
+        "pair_friction": put(model.pair_friction, (slice(None), slice(0, 2)), friction),
+    }
+
+
+def _principal(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """(3, 3) a body's principal axes, as columns, in its frame."""
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[body])
+    return axes.reshape(3, 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class _AtRest:
+    """Jacobians and inertia of the nominal model at qpos0."""
+
+    trunk: int
+    inertia: np.ndarray
+    """(nv, nv) without the trunk's part."""
+    centres: np.ndarray
+    """(nbody, 3, nv) of the bodies' centres of mass; the trunk's: of its frame's origin."""
+    turns: np.ndarray
+    """(nbody, 3, nv) rotational."""
+    trunk_turns: np.ndarray
+    """(3, nv) the trunk's, about its principal axes."""
+
+
+@functools.lru_cache(maxsize=8)
+def _at_rest(model: mujoco.MjModel, trunk: int) -> _AtRest:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_makeM(model, data)
+    whole = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, whole)
+    centres, turns = np.zeros((2, model.nbody, 3, model.nv))
+    for body in range(model.nbody):
+        mujoco.mj_jacBodyCom(model, data, centres[body], turns[body], body)
+    principal = _principal(model, trunk).T @ turns[trunk]
+    part = _spatial_inertia(
+        centres[trunk], principal, model.body_mass[trunk], model.body_inertia[trunk]
+    )
+    mujoco.mj_jacBody(model, data, centres[trunk], None, trunk)
+    return _AtRest(trunk, whole - part, centres, turns, principal)
+
+
+def _spatial_inertia(centre: Array, turn: Array, mass: Array, inertia: Array) -> Array:
+    """Joint-space inertia (..., nv, nv) of a body, `turn` about its principal axes."""
+    xp = centre.__array_namespace__()
+    moving = xp.asarray(mass)[..., None, None] * (xp.matrix_transpose(centre) @ centre)
+    return moving + turn.T @ (xp.asarray(inertia)[..., None] * turn)
+
+
+def inverse_weights(
+    scene: Scene, mass: Array, centre: Array, inertia: Array
+) -> tuple[Array, Array]:
+    """Body and dof inverse weights, which scale the constraints, for another trunk.
+
+    What `mj_setConst` computes: the mean diagonal of J M^-1 J^T at qpos0, of the centre of
+    mass for bodies, of the joint's own directions for dofs. At qpos0 all frames are aligned
+    with the world's.
+
+    Args:
+      scene: the nominal model.
+      mass: (...) of the trunk, kg.
+      centre: (..., 3) its centre of mass in its frame, m.
+      inertia: (..., 3) its principal inertia, kg m^2.
+
+    Returns:
+      body_invweight0 (..., nbody, 2) and dof_invweight0 (..., nv).
+    """
+    model, xp = scene.model, mass.__array_namespace__()
+    rest = _at_rest(model, model.body(f"{ROBOT}{scene.robot.trunk}").id)
+    turn = rest.turns[rest.trunk]
+    # v(centre) = v(origin) + omega x centre
+    lever = -xp.cross(centre[..., None, :], turn.T, axis=-1)
+    moved = rest.centres[rest.trunk] + xp.matrix_transpose(lever)
+    whole = rest.inertia + _spatial_inertia(moved, rest.trunk_turns, mass, inertia)
+    inverse = xp.linalg.inv(whole)
+
+    def mean_diagonal(jacobian: Array) -> Array:
+        product = xp.einsum("...iv,...vw,...iw->...i", jacobian, inverse[..., None, :, :], jacobian)
+        return product.mean(axis=-1)
+
+    others = np.arange(model.nbody) != rest.trunk
+    centres = xp.where(others[:, None, None], rest.centres, moved[..., None, :, :])
+    weights = xp.stack((mean_diagonal(centres), mean_diagonal(rest.turns)), axis=-1)
+    diagonal = xp.diagonal(inverse, axis1=-2, axis2=-1)
+    return weights, diagonal @ _joint_means(model)
+
+
+def _joint_means(model: mujoco.MjModel) -> np.ndarray:
+    """(nv, nv) matrix that averages over the three dofs of a free joint's halves."""
+    means = np.eye(model.nv)
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        for half in range(2):
+            start = model.jnt_dofadr[joint] + 3 * half
+            means[start : start + 3, start : start + 3] = 1 / 3
+    return means

@@ -1,0 +1,302 @@
+"""Builds the MuJoCo model from `scenes/*.xml` and the config; finds the standing state."""
+
+import dataclasses
+import hashlib
+
+import mujoco
+import numpy as np
+
+from mjx_balance.config import Config, ConfigError
+from mjx_balance.robots.build import (
+    ACCELEROMETER,
+    BOARD_SIZE,
+    GYRO,
+    VISUAL_GROUP,
+    scene_dir,
+)
+from mjx_balance.robots.catalogue import Robot, find_robot, robot_file, robot_spec
+from mjx_balance.task import Array
+from mjx_balance.task.decision import Targets
+from mjx_balance.task.kinematics import joint_angles
+
+ROBOT, BOARD = "robot/", "board/"
+CONTACT_TIME = 0.01
+"""Time constant of the foot contacts, s: near the shortest that 4 ms steps carry."""
+SETTLE_STEPS = 750
+SETTLE_ROUNDS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Stance:
+    """The settled standing state, the start of every episode."""
+
+    qpos: np.ndarray
+    """(nq,)"""
+    qvel: np.ndarray
+    """(nv,)"""
+    qacc_warmstart: np.ndarray
+    """(nv,)"""
+    leg_trim: np.ndarray
+    """(legs, 3) rad added to the joint angles, so that the loaded servos stand where
+    they are told: the robot's own weight would otherwise bend the legs by millimetres."""
+    imu: np.ndarray
+    """(6,) gyro in rad/s and accelerometer in m/s^2 at rest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A compiled model and the addresses everything else needs, looked up once by name."""
+
+    config: Config
+    """What it was built from."""
+    robot: Robot
+    model: mujoco.MjModel
+    leg_qpos: np.ndarray
+    """(legs, 3) addresses of the leg joints in qpos."""
+    leg_ctrl: np.ndarray
+    """(legs, 3) addresses of the leg servos in ctrl."""
+    board_qpos: np.ndarray
+    """(2,) addresses of the board hinges, X and Y, in qpos."""
+    board_ctrl: np.ndarray
+    """(2,) addresses of the board servos in ctrl."""
+    trunk_quat: np.ndarray
+    """(4,) addresses of the trunk's orientation in qpos."""
+    trunk_velocity: np.ndarray
+    """(2,) addresses of the trunk's velocity along the world's x and y in qvel."""
+    imu: np.ndarray
+    """(6,) addresses of gyro and accelerometer in sensordata."""
+    stance: Stance
+
+    def ctrl(self, targets: Targets) -> Array:
+        """Servo targets (..., sim_steps, nu) in the model's order, rad."""
+        joints = targets.joints + self.stance.leg_trim.astype(targets.joints.dtype)
+        xp = joints.__array_namespace__()
+        flat = (targets.board, joints.reshape(*joints.shape[:-2], -1))
+        order = np.argsort(np.concatenate((self.board_ctrl, self.leg_ctrl.ravel())))
+        return xp.concatenate(flat, axis=-1)[..., order]
+
+    @property
+    def hash(self) -> str:
+        """Fingerprint of the physics: equal for equal dynamics, whatever the looks."""
+        return scene_hash(self.model)
+
+
+def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
+    """Assembles and compiles stage, board and robot.
+
+    Args:
+      config: gives the time step, the standing height and the foot friction.
+      visual: whether to keep the geoms that are only looked at; without them
+        MJX has a sixth of the geoms to move.
+
+    Raises:
+      ConfigError: if the robot's file asks for a board that its feet do not fit on.
+    """
+    robot = find_robot(config.robot)
+    stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
+    for looked in (*stage.cameras, *stage.worldbody.geoms):  # from as far as it is large
+        looked.pos = looked.pos * robot.size_scale
+    height = config.task.body_height
+    body = robot_spec(config.robot, visual)
+    size = body.numeric(BOARD_SIZE)
+    board = _board(robot, None if size is None else float(size.data[0]))
+    stage.attach(board, prefix=BOARD, frame=stage.worldbody.add_frame())
+    for name in (x for x in dir(stage.option) if not x.startswith("_")):
+        setattr(body.option, name, getattr(stage.option, name))
+    stage.attach(body, prefix=ROBOT, frame=stage.worldbody.add_frame(pos=[0, 0, height]))
+    friction = robot.foot_friction
+    for leg in robot.legs:
+        stage.add_pair(
+            name=f"{leg.name}_contact",
+            geomname1=f"{ROBOT}{leg.foot}",
+            geomname2=f"{BOARD}board",
+            condim=3,
+            friction=[friction, friction, 0.005, 0.0001, 0.0001],
+            solref=[CONTACT_TIME, 1],
+        )
+    stage.option.timestep = config.task.sim_dt
+    if not visual:
+        for geom in [g for g in stage.geoms if g.group == VISUAL_GROUP]:
+            stage.delete(geom)
+    return stage.compile()
+
+
+def _board(robot: Robot, size: float | None) -> mujoco.MjSpec:
+    """The board, as large, heavy and stiff for this robot as ours is for our own.
+
+    Args:
+      robot: gives mass and size.
+      size: length of the board, m; none: by the robot's.
+
+    Raises:
+      ConfigError: if its feet do not fit on a board of that size.
+    """
+    board = mujoco.MjSpec.from_file(str(scene_dir() / "board.xml"))
+    longer, heavier = robot.size_scale, robot.mass_scale
+    if size is not None:
+        half_length, half_width, _ = board.geom("board").size
+        longer = size / (2 * half_length)
+        feet = robot.half_length / half_length, robot.half_track / half_width
+        if longer < max(feet):
+            raise ConfigError(
+                f"robot {robot.name}: board_size is {size:g} m; for its feet to stand on the board "
+                f"it must be at least {2 * half_length * max(feet):.2f}"
+            )
+    if longer == heavier == 1:
+        return board
+    for geom in board.geoms:
+        geom.pos, geom.size = geom.pos * longer, geom.size * longer
+        geom.fromto = geom.fromto * longer
+    body = board.body("board")
+    body.mass, body.inertia = body.mass * heavier, body.inertia * heavier * longer**2
+    body.ipos = body.ipos * longer
+    for joint in board.joints:
+        joint.armature *= heavier * longer**2
+        joint.damping = joint.damping * heavier * longer**2
+    for servo in board.actuators:
+        servo.set_to_position(kp=servo.gainprm[0] * heavier * longer**2)
+    return board
+
+
+def load_scene(config: Config, visual: bool = False) -> Scene:
+    """Builds the model, looks its addresses up and settles the robot.
+
+    Raises:
+      ConfigError: if the robot does not come to rest upright.
+    """
+    robot = find_robot(config.robot)
+    model = build_model(config, visual)
+    names = [[f"{ROBOT}{joint}" for joint in leg] for leg in robot.joints]
+    leg_qpos = np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names])
+    leg_ctrl = np.asarray([[model.actuator(n).id for n in leg] for leg in names])
+    board = [f"{BOARD}board_{axis}" for axis in "xy"]
+    joint = model.joint(int(model.body(f"{ROBOT}{robot.trunk}").jntadr[0]))
+    root = joint.qposadr[0]
+    sensors = [model.sensor(f"{ROBOT}{name}") for name in (GYRO, ACCELEROMETER)]
+    imu = np.concatenate([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in sensors])
+    return Scene(
+        config=config,
+        robot=robot,
+        model=model,
+        leg_qpos=leg_qpos,
+        leg_ctrl=leg_ctrl,
+        board_qpos=np.asarray([model.joint(n).qposadr[0] for n in board]),
+        board_ctrl=np.asarray([model.actuator(n).id for n in board]),
+        trunk_quat=np.arange(root + 3, root + 7),
+        trunk_velocity=joint.dofadr[0] + np.arange(2),
+        imu=imu,
+        stance=settle(config, robot, model, leg_qpos, leg_ctrl, root, imu),
+    )
+
+
+def settle(
+    config: Config,
+    robot: Robot,
+    model: mujoco.MjModel,
+    leg_qpos: np.ndarray,
+    leg_ctrl: np.ndarray,
+    root: int,
+    imu: np.ndarray,
+) -> Stance:
+    """Lets the robot come to rest on the level board, joints where they were told to be.
+
+    A position servo under load stands off its target. Each round adds that error
+    to the trim, as the integral term of a servo would.
+    """
+    task = config.task
+    wanted = joint_angles(robot, np.full(len(robot.legs), task.body_height))
+    trim = np.zeros_like(wanted)
+    data = mujoco.MjData(model)
+    data.qpos[root : root + 7] = (0, 0, task.body_height, 1, 0, 0, 0)
+    data.qpos[leg_qpos] = wanted
+    for _ in range(SETTLE_ROUNDS):
+        data.ctrl[leg_ctrl] = wanted + trim
+        mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
+        trim = trim + wanted - data.qpos[leg_qpos]
+    data.ctrl[leg_ctrl] = wanted + trim
+    data.qpos[root : root + 2] = 0
+    mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
+    upright = np.abs(data.qpos[root + 4 : root + 6]).max() < 0.01
+    if not (upright and np.abs(data.qvel).max() < 0.01):
+        share = np.abs(data.actuator_force[leg_ctrl]) / model.actuator_forcerange[leg_ctrl, 1]
+        leg, joint = np.unravel_index(np.argmax(share), share.shape)
+        if share.max() > 0.99:
+            raise ConfigError(
+                f"robot {robot.name} weighs {robot.total_mass:.1f} kg, too much for its servos: "
+                f"{robot.legs[leg].joints[joint]!r} needs more than its "
+                f"{model.actuator_forcerange[leg_ctrl[leg, joint], 1]:g} N m to stand at "
+                f"body_height {task.body_height} m"
+            )
+        raise ConfigError(
+            f"robot {robot.name} does not stand still at body_height {task.body_height} m with "
+            f"servo_stiffness {robot.servo_stiffness:g} N m/rad: {_why(config, robot, model, root)}"
+        )
+    return Stance(
+        qpos=data.qpos.copy(),
+        qvel=data.qvel.copy(),
+        qacc_warmstart=data.qacc_warmstart.copy(),
+        leg_trim=trim,
+        imu=data.sensordata[imu].copy(),
+    )
+
+
+def _why(config: Config, robot: Robot, model: mujoco.MjModel, root: int) -> str:
+    """What keeps a robot from standing, as far as one can tell."""
+    data = mujoco.MjData(model)
+    data.qpos[root + 3] = 1
+    mujoco.mj_forward(model, data)
+    trunk = model.body(f"{ROBOT}{robot.trunk}").id
+    for axis, centre, one, other in zip(
+        "xy", data.subtree_com[trunk], ("ahead", "left"), ("behind", "right"), strict=False
+    ):
+        feet = robot.each(axis)
+        if not feet.min() < centre < feet.max():
+            way = one if centre > feet.max() else other
+            return (
+                f"its centre of mass is {1000 * abs(centre):.0f} mm {way} of the trunk's origin, "
+                f"and its feet stand from {1000 * feet.min():.0f} to {1000 * feet.max():.0f} mm"
+            )
+    file = robot_file(config.robot)
+    names = ("servo_stiffness", "servo_damping", "servo_armature", "body_height")
+    said = [name for name in names if getattr(file, name) is not None]
+    if said:
+        return f"leave out {', '.join(said)} of its file, and the rules give others"
+    return "neither its centre of mass nor its file says why; look at its picture"
+
+
+_HASHED = (
+    "body_parentid body_mass body_inertia body_ipos body_iquat body_pos body_quat "
+    "body_gravcomp jnt_type jnt_axis jnt_pos jnt_range jnt_limited jnt_solref jnt_solimp "
+    "jnt_margin jnt_stiffness jnt_actfrclimited jnt_actfrcrange qpos0 qpos_spring "
+    "dof_parentid dof_armature dof_damping dof_frictionloss dof_solref dof_solimp "
+    "actuator_trntype actuator_trnid actuator_dyntype actuator_dynprm actuator_gaintype "
+    "actuator_gainprm actuator_biastype actuator_biasprm actuator_forcelimited "
+    "actuator_forcerange actuator_ctrllimited actuator_ctrlrange actuator_gear site_bodyid "
+    "site_pos site_quat pair_friction pair_solref pair_solimp pair_margin pair_gap pair_dim "
+    "pair_solreffriction sensor_type sensor_objid sensor_cutoff sensor_noise"
+).split()
+_HASHED_OPTIONS = (
+    "timestep gravity wind density viscosity integrator cone impratio jacobian solver iterations "
+    "tolerance ls_iterations ls_tolerance noslip_iterations noslip_tolerance o_margin o_solref "
+    "o_solimp o_friction disableflags enableflags disableactuator"
+).split()
+
+
+def scene_hash(model: mujoco.MjModel) -> str:
+    """Hashes what the dynamics depend on, the solver included, to six significant digits.
+
+    Args:
+      model: with or without its visual geoms; both give the same hash.
+
+    Returns:
+      16 hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    touching = np.r_[model.pair_geom1, model.pair_geom2]
+    parts = [getattr(model, name) for name in _HASHED]
+    geoms = (model.geom_type, model.geom_size, model.geom_pos, model.geom_quat, model.geom_bodyid)
+    parts += [field[touching] for field in geoms]
+    parts += [getattr(model.opt, name) for name in _HASHED_OPTIONS]
+    for part in parts:
+        digest.update(",".join(f"{x:.6g}" for x in np.ravel(part)).encode() + b";")
+    return digest.hexdigest()[:16]

@@ -1,0 +1,259 @@
+"""What a run computes on: one process, its JAX devices, their memory, the learner over them."""
+
+import contextlib
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import psutil
+from jax.sharding import PartitionSpec
+
+from mjx_balance.config import (
+    Config,
+    ConfigError,
+    check,
+    combinations,
+    flatten,
+    members,
+    preset,
+    to_dict,
+)
+from mjx_balance.dqn.learner import REPLICATED, Learner
+from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.files.run_folder import write_json
+from mjx_balance.policy.file import network_branches
+from mjx_balance.sim.engines.mujoco import cores
+from mjx_balance.training.program_cache import Say, cache_dir, enable_compilation_cache
+
+SIZES_FILE = "sizes.json"
+"""In the cache: numbers of envs by device and engine, as measured."""
+NEAR_BEST = 0.9
+"""Share of the best rate from which on more envs are not worth their memory and their batches."""
+STATE_COPIES = 2
+"""A checkpoint is read back beside the state that it replaces."""
+ENV_BYTES = 40_000
+"""Of each env while MJX steps it: twice what XLA plans for on a CPU, which fuses more."""
+PROGRAM_BYTES = 1.3 * 2**30
+"""Memory of a run besides: libraries, compiler, program (benchmarks/README.md)."""
+CPU_ENVS = 256
+"""What the sizes of presets without `num_envs` are meant for."""
+ACCELERATOR_ENVS = 2_048
+"""Of an accelerator that has not been measured."""
+COUNTED_IN_ENVS = ("num_env_steps", "log_every", "eval_every")
+LEARNER_COUNTED_IN_ENVS = (
+    *("batch_size", "replay_capacity", "min_replay_size", "epsilon_decay_steps", "whiten_steps"),
+)
+"""Sizes that grow with the number of envs, so that a run keeps its decisions of each env and its
+updates, each with more transitions: the replay ratio stays."""
+
+
+def configure_jax(say: Say) -> None:
+    """Makes every CPU core of this process a JAX device and turns the compilation cache on."""
+    # Too late if JAX is already in use, as in a notebook: its devices do as they are.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", cores())
+    enable_compilation_cache(say)
+
+
+def size_to_device(config: Config, most: int | None = None) -> Config:
+    """Fills in what the config leaves to the device; what it says stays.
+
+    Args:
+      config: of a run.
+      most: envs to choose, for want of memory.
+
+    Raises:
+      ConfigError: if the envs cannot be spread over that many devices.
+    """
+    available = jax.devices()
+    on_cpu = available[0].platform == "cpu"
+    if config.engine == "mujoco" and not on_cpu:
+        raise ConfigError(
+            f"engine is mujoco, which runs on CPUs, and JAX uses {available[0].device_kind}; set "
+            "JAX_PLATFORMS=cpu, or choose engine mjx"
+        )
+    if config.engine == "warp" and available[0].platform not in ("cpu", "gpu", "cuda"):
+        raise ConfigError(
+            f"engine is warp, which runs on NVIDIA GPUs and CPUs, and JAX uses "
+            f"{available[0].device_kind}; choose engine mjx"
+        )
+    if config.num_envs is None:
+        wanted = CPU_ENVS if on_cpu else measured_envs(config.engine) or ACCELERATOR_ENVS
+        config = widened(config, min(wanted, most or wanted))
+    num_envs, batch_size = config.num_envs, config.dqn.batch_size
+    assert num_envs is not None
+    num_devices, processes = config.num_devices, jax.process_count()
+    if num_devices is None:
+        num_devices = _even_share(len(available), processes, num_envs, batch_size)
+    elif num_devices > len(available):
+        raise ConfigError(
+            f"num_devices is {num_devices}; this machine has {len(available)} JAX devices"
+        )
+    if num_devices % processes:
+        raise ConfigError(
+            f"num_devices is {num_devices}; it must be a multiple of num_processes, {processes}"
+        )
+    for name, value in (("num_envs", num_envs), ("batch_size", batch_size)):
+        if value % num_devices:
+            raise ConfigError(
+                f"{name} is {value}; it must be a multiple of num_devices, {num_devices}"
+            )
+    return check(dataclasses.replace(config, num_devices=num_devices))
+
+
+def widened(config: Config, num_envs: int) -> Config:
+    """The config with so many envs, and as much more of everything that it does not say itself.
+
+    That is every size that is still its preset's.
+    """
+    usual, scale = preset(config.preset), num_envs / CPU_ENVS
+
+    def more(own: Any, usual: Any, names: Sequence[str]) -> dict[str, int]:
+        values = {name: getattr(own, name) for name in names}
+        kept = {name: x for name, x in values.items() if x == getattr(usual, name)}
+        return {name: round(scale * x) for name, x in kept.items()}
+
+    learner = more(config.dqn, usual.dqn, LEARNER_COUNTED_IN_ENVS)
+    own = more(config, usual, COUNTED_IN_ENVS)
+    dqn = dataclasses.replace(config.dqn, **learner)
+    return dataclasses.replace(config, num_envs=num_envs, dqn=dqn, **own)
+
+
+def grown(wanted: Config, sized: Config) -> list[str]:
+    """What to tell the user of sizes that follow from the device: a line, or none."""
+    before, after = flatten(to_dict(wanted)), flatten(to_dict(sized))
+    names = (*COUNTED_IN_ENVS, *LEARNER_COUNTED_IN_ENVS)
+    changed = [f"{name} {after[name]:,}" for name in names if after[name] != before[name]]
+    if not changed:
+        return []
+    return [f"with num_envs {sized.num_envs:,} come {', '.join(changed)}; what you say stays"]
+
+
+def measured_envs(engine: str) -> int | None:
+    """The number of envs that was found best for this device; none if nobody measured it."""
+    found = _measured_sizes().get(_device(engine))
+    return found if isinstance(found, int) and found > 0 else None
+
+
+def remember_envs(engine: str, rates: Mapping[int, float]) -> int:
+    """Keeps the number of envs to size runs on this device by: the fewest that come near the best.
+
+    Args:
+      engine: that was measured.
+      rates: number of envs -> physics steps per second.
+    """
+    enough = NEAR_BEST * max(rates.values())
+    chosen = min(num_envs for num_envs, rate in rates.items() if rate >= enough)
+    known = _measured_sizes()
+    cache_dir().mkdir(parents=True, exist_ok=True)
+    write_json(cache_dir() / SIZES_FILE, known | {_device(engine): chosen})
+    return chosen
+
+
+def _measured_sizes() -> dict[str, Any]:
+    """By device and engine; nothing if the file is missing or damaged."""
+    try:
+        known = json.loads((cache_dir() / SIZES_FILE).read_text())
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def _device(engine: str) -> str:
+    return f"{jax.devices()[0].device_kind}, engine {engine}"
+
+
+def _even_share(available: int, processes: int, *counts: int) -> int:
+    """As many devices as share each of the counts out evenly, the same number in each process."""
+    possible = range(available - available % processes, processes, -processes)
+    return next((n for n in possible if not any(count % n for count in counts)), processes)
+
+
+def used_devices(num_devices: int) -> list[Any]:
+    """The devices of a run's mesh, the same number of every process, in their order.
+
+    Raises:
+      ConfigError: if one has fewer.
+    """
+    each, found = num_devices // jax.process_count(), []
+    for k in range(jax.process_count()):
+        own = jax.local_devices(process_index=k)
+        if len(own) < each:
+            raise ConfigError(
+                f"num_devices is {num_devices}, {each} per process; process {k} has {len(own)}"
+            )
+        found += own[:each]
+    return found
+
+
+def make_learner(config: Config, env: BalanceEnv) -> Learner:
+    """The DQN for a config that `size_to_device` has completed."""
+    assert config.num_envs is not None
+    assert config.num_devices is not None
+    runs = members(config)
+    swept = combinations(config)[0]
+    return Learner(
+        env,
+        QNetwork(config.dqn.hidden_sizes, network_branches(config), config.dqn.head == "radial"),
+        config.dqn,
+        config.num_envs,
+        config.num_env_steps,
+        used_devices(config.num_devices),
+        len(runs),
+        env.symmetries,
+        env.action_factors,
+        env.reset_staggered,
+        {name: [getattr(own.dqn, name) for own in runs] for name in swept},
+    )
+
+
+def check_memory(learner: Learner) -> None:
+    """Refuses a run that would not fit into a device or into this machine, before it allocates.
+
+    Raises:
+      ConfigError: with the estimate.
+    """
+    needed = device_bytes(learner)
+    device = learner.mesh.devices.ravel()[0]
+    if device.platform == "cpu":
+        mine = [x for x in learner.mesh.devices.ravel() if x.process_index == jax.process_index()]
+        where, needed = "this machine", len(mine) * needed
+        available = psutil.virtual_memory().available
+    else:
+        where, stats = "each device", device.memory_stats() or {}
+        available = stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)
+    needed += PROGRAM_BYTES
+    if needed > available:
+        raise ConfigError(
+            f"{learner.num_seeds} runs with num_envs {learner.num_envs} and replay_capacity "
+            f"{learner.config.replay_capacity} take about {needed / 2**30:.1f} GiB of {where}, and "
+            f"{available / 2**30:.1f} GiB are free; lower num_envs, replay_capacity or the number "
+            "of runs"
+        )
+
+
+def device_bytes(learner: Learner) -> float:
+    """Memory that a run takes on each of its devices, besides its program."""
+    shapes = jax.eval_shape(lambda: learner.init(0))
+
+    def own(spec: PartitionSpec, part: Any) -> float:
+        whole = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(part))
+        return whole if spec == REPLICATED else whole / learner.num_devices
+
+    state = sum(jax.tree.leaves(jax.tree.map(own, learner.specs, shapes)))
+    envs = learner.num_seeds * learner.num_envs / learner.num_devices
+    return STATE_COPIES * state + ENV_BYTES * envs
+
+
+def explained(error: Exception) -> str | None:
+    """What the user can do about an error of a running program, in a sentence; none if unknown."""
+    said = str(error)
+    if "RESOURCE_EXHAUSTED" in said:
+        return "the device has no memory left; lower num_envs, num_seeds or replay_capacity"
+    if "WarpOverflowError: " in said:
+        return said.partition("WarpOverflowError: ")[2].splitlines()[0]
+    return None

@@ -1,0 +1,447 @@
+"""Bad input: one sentence, exit code 2, nothing touched."""
+
+import dataclasses
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import videos
+
+from mjx_balance.cli import main
+from mjx_balance.config import ConfigError, preset, to_dict
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.evaluation.controllers import make_controller
+from mjx_balance.evaluation.rollout import observing, run_suite, summarize
+from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked
+from mjx_balance.policy.file import PolicyError, load_policy
+from mjx_balance.render.drawing import VIDEO_SIZE
+from mjx_balance.sim.scene import load_scene, scene_dir
+from mjx_balance.training import run
+from mjx_balance.training.checkpoints import CheckpointError
+
+SHIPPED = Path(__file__).parents[2] / "policies" / "best.safetensors"
+
+
+@pytest.fixture(autouse=True)
+def _in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Runs a command that must be refused; returns what it said."""
+    try:
+        code = main(arguments)
+    except SystemExit as stopped:  # tyro's own refusals
+        code = stopped.code
+    assert code == 2
+    said = capsys.readouterr()
+    return said.err + said.out
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--preset", "huge"), "unknown preset 'huge'; known presets: paper, default, best"),
+        (("--warp-speed", "9"), "--warp-speed"),
+        (("--gamma", "much"), "--gamma"),
+        (("--gamma", "1.5"), "gamma is 1.5"),
+        (("--target-period", "3"), "target_period is 3.0 s"),
+        (("--ctrl-dt", "0"), "ctrl_dt is 0.0"),
+        (("--ctrl-dt", "0.0101"), "ctrl_dt is 0.0101 s; it must be a whole multiple"),
+        (("--max-incline", "12"), "max_incline is 12.0 deg"),
+        (("--num-envs", "0"), "num_envs is 0"),
+        (("--num-seeds", "0"), "num_seeds is 0"),
+        (
+            ("--num-seeds", "100000", "--num-envs", "64"),
+            "100000 runs with num_envs 64 and replay_capacity",
+        ),
+        (("--replay-capacity", "4000000000"), "replay_capacity 4000000000 take about"),
+        (("--seed", "4294967296"), "seed is 4294967296"),
+        (("--reward-tilt", "sideways"), "--reward-tilt"),
+        (("--payload", "-1"), "payload is -1.0"),
+        (("--preset", "paper", "--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
+        (("--robot", "rex"), "robot is 'rex'; known robots: aliengo, b2"),
+        (("--robot", "rex.toml"), "no robot file at rex.toml"),
+        (("--num-envs", "64", "--num-devices", "8"), "num_devices is 8"),
+        (("--eval-scenarios", "100000000"), "eval_scenarios is 100000000 and duration 60 s: that"),
+        (("--learning-rate", "nan"), "learning_rate is nan"),
+        (("--resume", "nowhere"), "nowhere is no run folder"),
+    ],
+)
+def test_impossible_training_is_refused(
+    capsys: pytest.CaptureFixture[str], flags: tuple[str, ...], named: str, tmp_path: Path
+) -> None:
+    assert named in " ".join(refuse(capsys, "train", *flags).split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_run_folder_is_left_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("precious")
+    said = refuse(capsys, "train", "--preset", "smoke", "--run-dir", "mine")
+    assert "run folder mine exists" in said
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_an_unwritable_run_folder_is_said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    said = refuse(capsys, "train", "--preset", "smoke", "--run-dir", "file/run")
+    assert "run folder file/run cannot be written" in said
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (ConfigError("seed is x"), 2, "mjx-balance: seed is x"),
+        (RunFolderError("it is finished"), 2, "mjx-balance: it is finished"),
+        (CheckpointError("none is whole"), 2, "mjx-balance: none is whole"),
+        (PolicyError("no finite numbers"), 1, "mjx-balance: no finite numbers"),
+        (
+            OSError(28, "No space left on device", "runs/a"),
+            1,
+            "mjx-balance: cannot write runs/a: No space left on device",
+        ),
+        (run.Interrupted("go on with --resume x"), 130, "go on with --resume x"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_no_training_ends_in_a_traceback(
+    error: BaseException,
+    code: int,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def train(*given: object) -> None:
+        raise error
+
+    monkeypatch.setattr(run, "train", train)
+    assert main(["train", "--preset", "smoke"]) == code
+    shown = capsys.readouterr()
+    assert " ".join((shown.out + shown.err).split()) == said
+
+
+def test_flags_start_from_the_preset_or_from_the_resumed_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr(run, "train", lambda *arguments: given.append(arguments[:3]))
+    assert main(["train", "--preset", "smoke", "--gamma", "0.7", "--run-dir", "a"]) == 0
+    config, run_dir, resume = given[0]
+    assert (config.preset, config.num_envs, config.dqn.gamma) == ("smoke", 64, 0.7)
+    assert (run_dir, resume) == (Path("a"), None)
+    assert main(["train"]) == 0
+    assert given[1][0] == preset("default")
+    saved = dataclasses.replace(preset("best"), seed=9, num_env_steps=77)
+    create_run_folder(tmp_path / "run", saved, {})
+    assert main(["train", "--resume", "run"]) == 0
+    assert given[2] == (saved, None, Path("run"))
+    assert main(["train", "--resume", "run", "--run-dir", "b"]) == 2
+
+
+def test_resuming_with_another_config_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    create_run_folder(folder, dataclasses.replace(preset("smoke"), num_devices=1), {})
+    said = refuse(capsys, "train", "--resume", "run", "--gamma", "0.9")
+    assert "run was started with gamma = 0.1, not 0.9" in said
+    said = refuse(capsys, "train", "--resume", "run", "--preset", "paper")
+    assert "run was started with preset = smoke, not paper" in said
+    assert sorted(os.listdir(folder)) == ["config.json", "provenance.json"]
+
+
+def test_resuming_in_another_scene_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    provenance = {"scene_hash": "of another scene", "versions": {}}
+    create_run_folder(
+        tmp_path / "run", dataclasses.replace(preset("smoke"), num_devices=1), provenance
+    )
+    said = " ".join(refuse(capsys, "train", "--resume", "run").split())
+    today = load_scene(preset("smoke")).hash
+    assert f"run was started with scene_hash of another scene, but it is {today} today" in said
+
+
+def test_resuming_a_run_at_work_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    config = dataclasses.replace(preset("smoke"), num_devices=1)
+    today = run.provenance(BalanceEnv(config))
+    folder = create_run_folder(tmp_path / "run", config, today)
+    with locked(folder):
+        said = " ".join(refuse(capsys, "train", "--resume", "run").split())
+    assert "another process works on the run in run;" in said
+
+
+def test_resuming_a_finished_run_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(preset("smoke"))))
+    (tmp_path / "evaluation.json").write_text("{}")
+    assert "is finished" in refuse(capsys, "train", "--resume", str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("fly",), "unknown command 'fly'; known commands: train, sweep, evaluate, report"),
+        (("sweep",), "say what to try, as gamma=0.1,0.4, or @FILE with such entries, before"),
+        (("sweep", "--seed", "1"), "say what to try, as gamma=0.1,0.4"),
+        (("sweep", "@nowhere"), "the values in nowhere cannot be read"),
+        (("sweep", "@text"), "sweep is 'this'; it must name one of learning_rate"),
+        (("sweep", "gamma=0.1", "tau=1", "--preset", "smoke"), "sweep is 'tau=1'; it must name"),
+        (("evaluate", "none.safetensors"), "no policy file at none.safetensors"),
+        (("evaluate", "."), "no policy file at .; "),
+        (("evaluate", "text"), "text is damaged or no safetensors file"),
+        (("evaluate",), "name a policy file or --controller NAME"),
+        (("evaluate", "text", "--controller", "none"), "name a policy file or --controller NAME"),
+        (("evaluate", "--controller", "lqr"), "unknown controller 'lqr'; known controllers: none"),
+        (
+            ("evaluate", "--controller", "none", "--suite", "moon"),
+            "unknown suite 'moon'; known suites: paper, corner, noise",
+        ),
+        (("report",), "name at least one run folder"),
+        (("report", "."), ". is no run folder: it has none of config.json"),
+        (("report", "nowhere"), "nowhere is no folder"),
+        (("evaluate", "text", "--json", "no/such/out.json"), "cannot write no/such/out.json"),
+        (("evaluate", "--controller", "none", "--json", "."), "cannot write .: it is a folder"),
+        (("report", ".", "--out", "no/such.html"), "cannot write no/such.html: its folder does"),
+        (("evaluate", "--controller", "none", "--video", "text"), "video is text; its name must"),
+        (("evaluate", "--controller", "none", "--seed", "-1"), "seed is -1"),
+        (("evaluate", "--controller", "none", "--scenarios", "0"), "scenarios is 0"),
+        (
+            ("evaluate", "--controller", "none", "--scenarios", "100000000"),
+            "scenarios is 100000000 and duration 60 s: that takes about",
+        ),
+        (("evaluate", "--controller", "none", "--duration", "1e12"), "duration 1e+12 s: that"),
+    ],
+)
+def test_impossible_commands_are_refused(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], named: str, tmp_path: Path
+) -> None:
+    (tmp_path / "text").write_text("this is no policy")
+    assert named in refuse(capsys, *arguments)
+    assert (tmp_path / "text").read_text() == "this is no policy"
+
+
+@pytest.mark.parametrize("who", ["controller", "policy"])
+def test_evaluate_writes_figures_and_a_video(
+    who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """0.4 s of a baseline and of a policy, to the end of the command."""
+    names = ("--controller", "pd-imu") if who == "controller" else (str(SHIPPED),)
+    flags = "--suite corner --scenarios 2 --duration 0.4 --seed 5 --json out.json --video v.mp4"
+    code = main(("evaluate", *names, *flags.split()))
+    said = capsys.readouterr()
+    result = json.loads((tmp_path / "out.json").read_text())
+    config = preset("default") if who == "controller" else load_policy(SHIPPED).config
+    scene = load_scene(config)
+    chosen = (
+        make_controller("pd-imu", scene) if who == "controller" else observing(load_policy(SHIPPED))
+    )
+    rollout = run_suite(scene, chosen, "corner", 2, 0.4, 5)
+    expected = summarize(rollout, "corner", 0.4, 5)
+    speeds = [found.pop("physics_steps_per_second") for found in (result, expected)]
+    assert result == expected
+    assert result["duration_s"] == 0.4
+    assert "corner  2 x 0.4 s      0" in said.out
+    assert f"{speeds[0]:,.0f} physics steps per second" in said.out
+    if code == 1 and "no video written" in said.err:
+        pytest.skip(said.err)
+    assert code == 0
+    assert "video of the first scenario: v.mp4" in said.out
+    fps, frames = videos.read(tmp_path / "v.mp4")
+    assert (fps, len(frames), frames.shape[1:3]) == (25, 10, VIDEO_SIZE[::-1])
+    assert np.abs(frames[-1] - frames[0]).mean() > 0.1, "the board moves"
+
+
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+@pytest.mark.parametrize("command", [(), ("robot",), ("robot", "check"), ("sweep",), ("view",)])
+def test_help_is_no_error(
+    command: tuple[str, ...], flag: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = main((*command, flag))
+    except SystemExit as stopped:  # tyro's own
+        code = stopped.code
+    said = capsys.readouterr()
+    assert (code, said.err) == (0, "")
+    assert said.out.startswith("usage: mjx-balance ")
+
+
+def full(number: int) -> None:
+    """Stands for `os.fsync` on a disk without room."""
+    raise OSError(28, "No space left on device")
+
+
+def test_a_full_disk_does_not_lose_the_table(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "out.json").write_text("older")
+    monkeypatch.setattr(os, "fsync", full)
+    flags = "--controller none --scenarios 1 --duration 0.2 --json out.json"
+    assert main(("evaluate", *flags.split())) == 2
+    said = capsys.readouterr()
+    assert "1 x 0.2 s" in said.out
+    assert said.err.endswith("mjx-balance: cannot write out.json: No space left on device\n")
+    assert [(x.name, x.read_text()) for x in tmp_path.iterdir()] == [("out.json", "older")]
+
+
+def test_a_full_disk_leaves_no_half_robot(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(os, "fsync", full)
+    assert main(("robot", "new", "scenes:quadruped.xml", "--out", "rex.toml")) == 2
+    assert "cannot write rex.toml: No space left on device" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_robots_draft_can_be_checked_and_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`robot new`, `robot check`, and the flag that a user then gives to `train`."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
+    assert main(["robot", "new", "model.xml", "--out", "rex.toml"]) == 0
+    assert "mjx-balance robot check rex.toml" in capsys.readouterr().out
+    assert 'model = "model.xml"' in Path("rex.toml").read_text()
+    assert main(["robot", "check", "rex.toml", "--picture", "rex.png"]) == 0
+    said = capsys.readouterr().out
+    assert "rex: 15.20 kg" in said
+    assert said.endswith("picture: rex.png\n")
+    assert Path("rex.png").stat().st_size > 50_000
+    assert main(["robot", "check", "rex.toml"]) == 0
+    assert capsys.readouterr().out.endswith("picture: rex-check.png\n")
+    assert main(["robot", "new", "model.xml"]) == 0
+    assert capsys.readouterr().out == Path("rex.toml").read_text()
+
+
+def test_a_robot_that_does_not_hold_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands on the level board, and is drawn where it ends on the tilted one."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
+    assert main(["robot", "new", "model.xml", "--out", "rex.toml"]) == 0
+    text = Path("rex.toml").read_text()
+    Path("rex.toml").write_text(text.replace("trunk =", "knee_torque = 5.6\ntrunk =", 1))
+    capsys.readouterr()
+    assert main(["robot", "check", "rex.toml"]) == 1
+    said = capsys.readouterr()
+    assert "mjx-balance: robot rex has no torque left at 7 deg" in said.err
+    assert "_knee' takes 100% of its own" in said.err
+    assert said.out.endswith("picture: rex-check.png\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("robot",), "say robot check FILE.toml, or robot new MODEL.xml"),
+        (("robot", "buy"), "say robot check FILE.toml"),
+        (("robot", "check", "none.toml"), "no robot file at none.toml"),
+        (
+            ("robot", "check", "none.toml", "--picture", "no/such.png"),
+            "cannot write no/such.png: its folder does not exist",
+        ),
+        (
+            ("robot", "check", "none.toml", "--picture", "rex.jpg"),
+            "picture is rex.jpg; its name must end in .png",
+        ),
+        (("robot", "new", "none.xml"), "there is no file none.xml"),
+        (("robot", "new", "menagerie:rex"), "menagerie:rex cannot be had"),
+        (("robot", "new", "rex.toml"), "rex.toml cannot be read"),
+        (("robot", "new", "model.xml", "--out", "rex.toml"), "rex.toml exists already"),
+        (("robot", "new", "model.xml", "--out", "gone/rex.toml"), "cannot write gone/rex.toml"),
+        (("evaluate", "--controller", "pd-imu", "--robot", "rex"), "robot is 'rex'"),
+    ],
+)
+def test_what_is_no_robot_is_refused(
+    arguments: tuple[str, ...],
+    named: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
+    Path("rex.toml").write_text("not a robot")
+    before = sorted(tmp_path.iterdir())
+    assert named in refuse(capsys, *arguments)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_policy_stands_on_its_own_robot_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever it is called here."""
+    said = refuse(capsys, "evaluate", str(SHIPPED), "--robot", "go1")
+    assert "trained for robot 'quadruped' (15.2 kg), and go1 is another one (12.7 kg" in said
+    flags = ["--scenarios", "1", "--duration", "1"]
+    assert main(["evaluate", str(SHIPPED), "--robot", "quadruped", *flags]) == 0
+
+
+class StubWindow:
+    """Shows three decisions and is closed, having pressed two keys."""
+
+    def __init__(self, config: Any, on_key: Any):
+        self.shown, self.said, self.on_key = [], [], on_key
+
+    @property
+    def is_open(self) -> bool:
+        return len(self.shown) < 3
+
+    def write(self, *texts: Any) -> None:
+        self.said.append(texts)
+
+    def play(self, states: np.ndarray) -> None:
+        self.shown.append(states)
+        self.on_key(262)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_view_shows_a_policy_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    windows: list[StubWindow] = []
+
+    def opened(*arguments: Any) -> StubWindow:
+        windows.append(StubWindow(*arguments))
+        return windows[0]
+
+    monkeypatch.setattr("mjx_balance.render.drawing.Window", opened)
+    assert main(["view", "best"]) == 0
+    (window,) = windows
+    assert [x.shape for x in window.shown] == [(50, 21)] * 3
+    assert "falls" in window.said[0][0][1]
+    assert "arrows: tilt the board" in window.said[0][1][1]
+    assert window.closed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ((), "name a policy file or --controller NAME"),
+        (("nobody",), "no policy file at nobody; `mjx-balance train` writes one, and best"),
+        (("best", "--suite", "sea"), "unknown suite 'sea'"),
+        (("--controller", "pd-imu", "--robot", "rex"), "robot is 'rex'"),
+        (("best", "--seed", "-1"), "seed is -1; it must not be negative"),
+        (("best",), "); `mjx-balance evaluate --video` needs no display\n"),
+    ],
+)
+def test_what_cannot_be_viewed_is_said(
+    arguments: tuple[str, ...],
+    named: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert named in refuse(capsys, "view", *arguments)

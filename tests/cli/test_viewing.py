@@ -1,0 +1,151 @@
+"""A board that keys tilt, and a robot that they kick."""
+
+import numpy as np
+import pytest
+
+from mjx_balance.cli.viewing import DOWN, KICK_KEY, LEFT, LEVEL, RIGHT, UP, Session
+from mjx_balance.evaluation.controllers import Controller, View, make_controller
+from mjx_balance.evaluation.rollout import run_suite
+from mjx_balance.evaluation.suites import SuiteError, make_scenarios
+from mjx_balance.sim.scene import Scene
+from mjx_balance.task.tilt import board_angle
+
+
+def session(scene: Scene, name: str = "pd-attitude", suite: str | None = None) -> Session:
+    return Session(scene, make_controller(name, scene), suite, seed=3)
+
+
+def board(scene: Scene, states: np.ndarray) -> np.ndarray:
+    """(sim_steps, 2) true angles of the board, deg."""
+    return np.degrees(states[:, scene.board_qpos])
+
+
+@pytest.mark.parametrize(
+    ("keys", "wanted"),
+    [
+        ((RIGHT,), (1, 0)),
+        ((LEFT, LEFT), (-2, 0)),
+        ((UP,), (0, -1)),
+        ((DOWN, DOWN, RIGHT), (1, 2)),
+        ((DOWN, RIGHT, LEVEL), (0, 0)),
+        ((65,), (0, 0)),
+        ((RIGHT,) * 40, (10.34, 0)),
+    ],
+    ids=str,
+)
+def test_the_board_goes_where_the_keys_say(
+    scene: Scene, keys: tuple[int, ...], wanted: tuple[float, float]
+) -> None:
+    """A degree each, as far as the legs reach, at the board's own rate of 3.5 deg/s."""
+    one = session(scene)
+    for key in keys:
+        one.press(key)
+    states = np.stack([one.decide() for _ in range(25)])
+    np.testing.assert_allclose(board(scene, states[-1])[-1], wanted, atol=0.05)
+    way = np.abs(np.diff(np.asarray([board(scene, x)[-1] for x in states]), axis=0)).max()
+    assert way <= 0.7 + 0.02
+    assert one.falls == 0
+    assert one.tilt < 0.5
+
+
+def test_a_target_that_changes_on_the_way(scene: Scene) -> None:
+    """Turned back after 0.4 s, at 1.4 deg, the board goes on from there, without a jump."""
+    one = session(scene)
+    for _ in range(5):
+        one.press(RIGHT)
+    path = [board(scene, one.decide()) for _ in range(2)]
+    one.press(LEVEL)
+    path += [board(scene, one.decide()) for _ in range(4)]
+    roll = np.concatenate(path)[:, 0]
+    assert roll.max() == pytest.approx(1.4, abs=0.05)
+    assert np.abs(np.diff(roll)).max() < 0.03
+    assert roll[-1] == pytest.approx(0, abs=0.05)
+
+
+def test_a_kick_moves_the_robot_once(scene: Scene) -> None:
+    one, other = session(scene), session(scene)
+    one.press(KICK_KEY)
+    kicked, quiet = one.decide(), other.decide()
+    root = scene.trunk_quat[0] - 3
+    way = np.linalg.norm(kicked[1, root : root + 2] - quiet[1, root : root + 2])
+    assert way == pytest.approx(0.4 * 0.008, rel=0.15), "0.4 m/s over two physics steps"
+    assert not one.kicked.any()
+
+
+def test_who_falls_is_put_back_up_on_a_level_board(scene: Scene) -> None:
+    one = session(scene, "none")
+    for _ in range(8):
+        one.press(RIGHT)
+    for _ in range(20):
+        one.decide()
+        if one.falls:
+            break
+    assert one.falls == 1
+    assert one.caption() == ("body tilt\nboard\nfalls", "0.00 deg\n+0.0, +0.0 deg\n1")
+    np.testing.assert_allclose(one.decide()[0], scene.stance.qpos, atol=1e-3)
+
+
+@pytest.mark.parametrize("suite", ["push", "payload", "noise", "latency"])
+def test_a_suite_is_shown_as_it_is_evaluated(scene: Scene, suite: str) -> None:
+    """The same states as `evaluate --suite ... --seed 3`: kicks, loads, noise and delays."""
+    controller: Controller = make_controller("pd-imu", scene)
+    rollout = run_suite(scene, controller, suite, 1, 60.0, 3, record=True)
+    assert rollout.qpos is not None
+    one = session(scene, "pd-imu", suite)
+    one.press(RIGHT)  # is not listened to
+    states = np.concatenate([one.decide() for _ in range(60)])
+    np.testing.assert_allclose(states, rollout.qpos[0, : len(states)], atol=1e-9)
+
+
+def test_the_next_round_of_a_suite_is_another_one(scene: Scene) -> None:
+    """That of the next seed; who stands still falls in every corner."""
+    one = session(scene, "none", "corner")
+    while one.falls < 2:
+        one.decide()
+    third, _ = make_scenarios(scene.config, "corner", 1, 60.0, seed=5)
+    np.testing.assert_array_equal(one.trials.scenarios.targets, third.targets)
+
+
+def test_a_negative_seed_is_refused(scene: Scene) -> None:
+    for suite in (None, "push"):
+        with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
+            Session(scene, make_controller("none", scene), suite, seed=-1)
+
+
+def test_a_kick_by_hand_comes_beside_those_of_a_suite(scene: Scene) -> None:
+    one, other = session(scene, suite="push"), session(scene, suite="push")
+    for _ in range(8):
+        one.decide()
+        other.decide()
+    one.press(KICK_KEY)
+    root = scene.trunk_quat[0] - 3
+    ways = [np.ptp(x[:, root : root + 2], axis=0) for x in (one.decide(), other.decide())]
+    assert np.linalg.norm(ways[0]) > 4 * np.linalg.norm(ways[1])
+
+
+def test_who_acts_sees_where_the_keyed_board_goes(scene: Scene) -> None:
+    """The scenario, read at the decision's own time, is the board that MuJoCo then has."""
+    seen: list[View] = []
+    stand = make_controller("pd-attitude", scene)
+
+    def watch(view: View) -> np.ndarray:
+        seen.append(view)
+        return stand(view)
+
+    one = Session(scene, watch)
+    states = []
+    for number in range(12):
+        if number in (2, 3, 7):
+            one.press((RIGHT, DOWN, LEFT)[number % 3])
+        states.append(board(scene, one.decide())[-1])
+    told = [
+        board_angle(one.task, view.scenario, np.asarray([[(view.decision + 1) * 0.2]]))[0, 0]
+        for view in seen
+    ]
+    np.testing.assert_allclose(states, told, atol=0.05)
+    assert np.abs(told).max() >= 1
+
+
+def test_an_unknown_suite_is_refused(scene: Scene) -> None:
+    with pytest.raises(SuiteError, match="unknown suite 'sea'"):
+        session(scene, suite="sea")

@@ -1,0 +1,196 @@
+"""Domain randomisation in MJX: what differs from env to env, and by how much."""
+
+import dataclasses
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from fleet import ENVS, KICKED, STAND, Fleet, keys, level, nominal, under
+
+from mjx_balance.config import RandomizationConfig, preset
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.task.observation import observation_names
+from mjx_balance.task.randomization import Conditions
+
+MANY = 4_000
+
+
+@pytest.fixture(scope="module")
+def drawn(fleet: Fleet) -> tuple[Conditions, Any, np.ndarray]:
+    """Circumstances, scenarios and kicks of many resets."""
+
+    def draw(key: jax.Array) -> Any:
+        info = fleet.env.reset(key).info
+        return info["conditions"], info["scenario"], info["kicks"]
+
+    return jax.device_get(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), MANY)))
+
+
+def test_circumstances_fill_their_ranges(drawn: tuple[Conditions, Any, np.ndarray]) -> None:
+    conditions, _, kicks = drawn
+    ranges = {
+        "payload": (conditions.payload, 0, 5),
+        "x": (conditions.payload_at[:, 0], -0.05, 0.05),
+        "y": (conditions.payload_at[:, 1], -0.05, 0.05),
+        "friction": (conditions.friction, 0.4, 1.0),
+        "gain": (conditions.gain, 0.8, 1.2),
+        "speed": (np.linalg.norm(kicks[:, 2], axis=-1), 0.05, 0.1),
+        "direction": (np.arctan2(kicks[:, 0, 1], kicks[:, 0, 0]), -np.pi, np.pi),
+    }
+    assert kicks.shape == (MANY, 3, 2)
+    for name, (values, low, high) in ranges.items():
+        test = scipy.stats.kstest(values, "uniform", (low, high - low))
+        assert test.pvalue > 1e-3, name
+    np.testing.assert_allclose(conditions.payload_at[:, 2], 0.08, rtol=1e-6)
+    assert set(conditions.latency) == {0, 1}
+    assert conditions.latency.mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(MANY))
+    sigma = np.asarray([0.002] * 3 + [0.023] * 3, np.float32)
+    np.testing.assert_allclose(conditions.imu_noise, np.tile(sigma, (MANY, 1)))
+
+
+def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any, np.ndarray]) -> None:
+    """A key used twice would tie a payload to a target."""
+    conditions, scenario, kicks = drawn
+    columns = np.column_stack(
+        (
+            conditions.payload,
+            conditions.payload_at[:, :2],
+            conditions.friction,
+            conditions.gain,
+            conditions.latency,
+            scenario.targets[:, 1],
+            np.linalg.norm(scenario.targets[:, 1], axis=-1),
+            scenario.phase,
+            kicks.reshape(MANY, -1),
+        )
+    )
+    together = scipy.stats.spearmanr(columns).statistic - np.eye(columns.shape[1])
+    assert np.abs(together).max() < 0.07
+
+
+def test_a_kick_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: Fleet) -> None:
+    """On level boards, robots given that velocity by hand move alike, whatever the decision."""
+    start = level(under(fleet.reset(keys(5)), nominal()))
+    kicks, physics = np.asarray(start.info["kicks"]), start.pipeline_state
+    free = fleet.env.scene.model.jnt_dofadr[fleet.env.scene.model.joint("robot/root").id]
+
+    def after(decision: int, velocity: np.ndarray) -> Any:
+        info = start.info | {"decision": jnp.full(ENVS, decision, jnp.int32)}
+        given = physics._replace(qvel=physics.qvel.at[:, free : free + 2].add(velocity))
+        state = fleet.step(start.replace(info=info, pipeline_state=given), np.full(ENVS, STAND))
+        return jax.device_get(state)
+
+    none, still = np.zeros((ENVS, 2)), after(1, np.zeros((ENVS, 2)))
+    for decision in (0, 12, 14, 24, 26, 49):
+        imu = after(decision, none).info["memory"].imu
+        np.testing.assert_allclose(imu, still.info["memory"].imu, atol=1e-3)
+    for k, decision in enumerate(KICKED):
+        kicked, by_hand = after(decision, none), after(1, kicks[:, k])
+        for name in ("qpos", "qvel"):
+            ours, theirs = (getattr(s.pipeline_state, name) for s in (kicked, by_hand))
+            np.testing.assert_allclose(ours, theirs, atol=1e-4)
+        shaken = np.abs(kicked.info["memory"].imu - still.info["memory"].imu).max(axis=(1, 2))
+        assert shaken.min() > 0.5, "m/s^2"
+
+
+def test_pushes_change_no_other_draw(fleet: Fleet) -> None:
+    """Training without pushes takes the random numbers that it took before there were any."""
+    config = fleet.env.config
+    calm = dataclasses.replace(config.randomization, push_min=0.0, push_max=0.0)
+    env = BalanceEnv(dataclasses.replace(config, randomization=calm))
+    ours, theirs = (jax.jit(e.reset)(jax.random.PRNGKey(7)) for e in (fleet.env, env))
+    info = {name: value for name, value in ours.info.items() if name != "kicks"}
+    jax.tree.map(np.testing.assert_array_equal, info, theirs.info)
+
+
+def test_nobody_is_kicked_unless_asked_for() -> None:
+    """Nor in an episode that ends, after 60 s, when the first kick is due."""
+    late = RandomizationConfig(push_max=0.2, push_period=60.0)
+    for random in (RandomizationConfig(), late):
+        env = BalanceEnv(dataclasses.replace(preset("default"), randomization=random))
+        assert "kicks" not in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).info
+
+
+SIGMA = np.linspace(0.5, 2, ENVS)[:, None] * np.asarray((0.001, 0.002, 0.003, 0.02, 0.04, 0.06))
+"""(ENVS, 6) noise of every env and channel, no two alike."""
+
+
+@pytest.fixture(scope="module")
+def noise(fleet: Fleet) -> tuple[np.ndarray, list[Any], list[Any]]:
+    """Noise (2, ENVS, 50, 6) of two decisions in units of its size, with and without it."""
+    loud = nominal()._replace(imu_noise=SIGMA.astype(np.float32))
+    runs = []
+    for conditions in (nominal(), loud):
+        state, states = under(fleet.reset(keys(4)), conditions), []
+        for _ in range(2):
+            state = fleet.step(state, np.full(ENVS, STAND))
+            states.append(jax.device_get(state))
+        runs.append(states)
+    clean, noisy = runs
+    imu = [np.asarray([s.info["memory"].imu for s in states], float) for states in runs]
+    return (imu[1] - imu[0]) / SIGMA[:, None], clean, noisy
+
+
+def test_noise_is_normal_and_of_the_size_asked_for(noise: Any) -> None:
+    """Per channel 3,200 numbers: standard errors are 0.018 of the mean, 0.0125 of the size."""
+    z = noise[0]
+    assert z.shape == (2, ENVS, 50, 6)
+    for channel in range(6):
+        values = z[..., channel].ravel()
+        assert abs(values.mean()) < 0.07
+        assert values.std() == pytest.approx(1, abs=0.05)
+        assert abs(scipy.stats.kurtosis(values)) < 0.4
+    # And of every env, 600 numbers.
+    np.testing.assert_allclose(z.std(axis=(0, 2, 3)), 1, atol=0.12)
+
+
+def test_noise_is_white_and_new_for_every_env_decision_and_channel(noise: Any) -> None:
+    z = noise[0]
+
+    def together(a: np.ndarray, b: np.ndarray) -> float:
+        return abs(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+
+    assert together(z[0], z[1]) < 0.05
+    for lag in (1, 2, 5, 25):
+        assert together(z[:, :, lag:], z[:, :, :-lag]) < 0.05
+    for a, b in itertools.combinations(range(6), 2):
+        assert together(z[..., a], z[..., b]) < 0.08
+    for env in range(ENVS - 1):
+        assert together(z[:, env], z[:, env + 1]) < 0.2
+
+
+def test_noise_is_seen_and_moves_nobody(fleet: Fleet, noise: Any) -> None:
+    _, clean, noisy = noise
+    names = np.asarray(observation_names(fleet.env.config.task, fleet.env.scene.robot))
+    for a, b in zip(clean, noisy, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, a.pipeline_state, b.pipeline_state)
+        np.testing.assert_array_equal(a.reward, b.reward)
+        difference = b.obs - a.obs
+        heights = np.char.startswith(names, "H_") | np.char.startswith(names, "C_")
+        np.testing.assert_array_equal(difference[:, heights], 0 * difference[:, heights])
+        # The newest five samples of the roll rate, in deg/s.
+        rate = (b.info["memory"].imu - a.info["memory"].imu)[:, -5:, 0].mean(axis=1)
+        entry = list(names).index("V_x,t-0")
+        np.testing.assert_allclose(difference[:, entry], np.degrees(rate), atol=1e-4)
+
+
+def test_envs_of_a_batch_move_in_their_own_circumstances(fleet: Fleet) -> None:
+    """Two payloads, gains and soles under one scenario: each is where it is alone."""
+    state = fleet.reset(keys(9))
+    drawn = jax.device_get(state.info["conditions"])
+    turned = [np.roll(x, 1, axis=0) for x in drawn]
+    scenario = jax.tree.map(lambda x: np.repeat(np.asarray(x)[:1], ENVS, 0), state.info["scenario"])
+    state = state.replace(info=state.info | {"scenario": scenario})
+    actions = np.full(ENVS, STAND + 42)
+    first, second = (
+        jax.device_get(fleet.step(under(state, conditions), actions)).pipeline_state.qpos
+        for conditions in (drawn, Conditions(*turned))
+    )
+    np.testing.assert_allclose(np.roll(first, 1, axis=0), second, atol=1e-6)
+    height = first[:, fleet.env.scene.trunk_quat[0] - 1]
+    assert len(np.unique(height)) == ENVS
+    assert np.ptp(height) > 1e-4

@@ -1,0 +1,215 @@
+"""Suites are what they say, and their scenarios depend on nothing but the seed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mjx_balance.config import Config, fitted, greatest_incline, preset
+from mjx_balance.evaluation.suites import (
+    SEEDS,
+    SUITES,
+    SuiteError,
+    authority,
+    find_suite,
+    make_pushes,
+    make_scenarios,
+)
+from mjx_balance.robots.catalogue import Robot
+from mjx_balance.task.randomization import DRAWS
+
+
+def with_task(config: Config, **values: float) -> Config:
+    return dataclasses.replace(config, task=dataclasses.replace(config.task, **values))
+
+
+def draws(seed: int, k: int, targets: int = 7) -> tuple[np.ndarray, np.ndarray]:
+    """Scenario k's own random numbers: two for every target, then those of its circumstances."""
+    rng = np.random.default_rng((seed, k))
+    return rng.uniform(size=(targets, 2)), rng.uniform(size=DRAWS + 2)
+
+
+def test_scenarios_depend_on_the_seed_and_not_on_their_number(config: Config) -> None:
+    for suite in SUITES:
+        few, many = (make_scenarios(config, suite, n, 60, 3) for n in (2, 5))
+        for short, long in zip((*few[0], *few[1]), (*many[0], *many[1]), strict=True):
+            np.testing.assert_array_equal(short, long[:2])
+    seeds = [make_scenarios(config, "paper", 5, 60, n)[0].targets for n in range(4)]
+    assert len(np.unique(np.concatenate(seeds)[:, 0], axis=0)) == 20, "no two are alike"
+
+
+def test_every_target_of_paper_and_corner_by_its_draw(config: Config) -> None:
+    """60 s need 7 targets. Published figures hold for these scenarios and no others."""
+    paper, corner = (make_scenarios(config, name, 3, 60.0, 5)[0] for name in ("paper", "corner"))
+    assert paper.targets.shape == corner.targets.shape == (3, 7, 2)
+    for k in range(3):
+        uniform, _ = draws(5, k)
+        turn, size = 2 * np.pi * uniform[:, 0], 7 * uniform[:, 1]
+        expected = np.stack((size * np.cos(turn), size * np.sin(turn)), axis=-1)
+        np.testing.assert_allclose(paper.targets[k], expected, atol=1e-12)
+        np.testing.assert_array_equal(corner.targets[k], np.where(uniform < 0.5, -7, 7))
+    for scenario in (paper, corner):
+        np.testing.assert_array_equal(scenario.phase, np.zeros(3))
+        np.testing.assert_array_equal(scenario.rate, np.full(3, 3.5))
+
+
+def test_circumstances_by_their_draws(config: Config) -> None:
+    """Draw 0 is the payload, 1 and 2 its place, 3 the friction, 4 the gain."""
+    names = ("payload", "friction", "gains")
+    payload, friction, gains = (make_scenarios(config, name, 4, 60.0, 2)[1] for name in names)
+    others = np.asarray([draws(2, k)[1] for k in range(4)])
+    np.testing.assert_allclose(payload.payload, 5 * others[:, 0])
+    np.testing.assert_allclose(payload.payload_at[:, 0], 0.1 * others[:, 1] - 0.05)
+    np.testing.assert_allclose(payload.payload_at[:, 1], 0.1 * others[:, 2] - 0.05)
+    np.testing.assert_allclose(friction.friction, 0.4 + 0.6 * others[:, 3])
+    np.testing.assert_allclose(gains.gain, 0.8 + 0.4 * others[:, 4])
+
+
+def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
+    """The targets of `paper`, at up to 4.453 deg/s or stretched up to the legs' reach."""
+    paper, fast, steep = (
+        make_scenarios(config, name, 4, 60.0, 2)[0] for name in ("paper", "fast", "steep")
+    )
+    others = np.asarray([draws(2, k)[1] for k in range(4)])
+    np.testing.assert_allclose(fast.rate, 3.5 + (4.4531 - 3.5) * others[:, DRAWS], atol=1e-4)
+    np.testing.assert_array_equal(fast.targets, paper.targets)
+    reach = greatest_incline(config.task, robot)
+    stretch = (7 + (reach - 7) * others[:, DRAWS + 1]) / 7
+    np.testing.assert_allclose(steep.targets, paper.targets * stretch[:, None, None])
+    np.testing.assert_array_equal(steep.rate, paper.rate)
+
+
+def test_pushes_by_their_draws(config: Config) -> None:
+    """Kicks of 0.2 to 0.4 m/s every 5 s; a scenario's come from a generator of their own."""
+    pushes = make_pushes(config, "push", 3, 60.0, 5)
+    assert pushes.at.tolist() == [25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 275]
+    for k in range(3):
+        speed, turn = np.random.default_rng((5, k, 2)).uniform(size=(11, 2)).T
+        speed, turn = 0.2 + 0.2 * speed, 2 * np.pi * turn
+        expected = np.stack((speed * np.cos(turn), speed * np.sin(turn)), axis=-1)
+        np.testing.assert_allclose(pushes.kicks[k], expected, atol=1e-12)
+    fewer, shorter = make_pushes(config, "push", 2, 60.0, 5), make_pushes(config, "push", 3, 26, 5)
+    np.testing.assert_array_equal(fewer.kicks, pushes.kicks[:2])
+    np.testing.assert_array_equal(shorter.kicks, pushes.kicks[:, :5])
+
+
+def test_pushes_happen_in_the_world_of_paper_and_in_no_other_suite(config: Config) -> None:
+    push, paper = (make_scenarios(config, name, 4, 60.0, 2) for name in ("push", "paper"))
+    for ours, theirs in zip((*push[0], *push[1]), (*paper[0], *paper[1]), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for name in SUITES:
+        kicks = make_pushes(config, name, 4, 60.0, 2).kicks
+        assert kicks.shape == (4, 11 if name == "push" else 0, 2)
+
+
+def test_a_config_beyond_the_limits_is_left_as_it_is(config: Config) -> None:
+    """A board that is faster than can be followed is no slower in `fast`."""
+    quick = with_task(config, board_rate=6.0)
+    np.testing.assert_array_equal(make_scenarios(quick, "fast", 3, 20, 0)[0].rate, np.full(3, 6.0))
+
+
+@pytest.mark.parametrize(("duration", "targets"), [(5.0, 2), (10.0, 2), (10.1, 3), (60.0, 7)])
+def test_there_are_targets_to_the_end(config: Config, duration: float, targets: int) -> None:
+    assert make_scenarios(config, "paper", 2, duration, 0)[0].targets.shape == (2, targets, 2)
+
+
+def test_a_board_that_does_not_arrive_is_refused(config: Config) -> None:
+    """14 deg at 3.5 deg/s take 4 s; in `steep` they may be 2 * 10.3 deg."""
+    just = with_task(config, target_period=4.0)
+    for suite in ("paper", "corner", "fast"):
+        make_scenarios(just, suite, 5, 20, 0)
+    with pytest.raises(
+        SuiteError, match=r"target_period is 4\.0 s, but in suite 'steep' .* [45]\.\d"
+    ):
+        make_scenarios(just, "steep", 50, 20, 0)
+    with pytest.raises(
+        SuiteError, match=r"target_period is 3\.99 s, but in suite 'corner' .* 4\.0"
+    ):
+        make_scenarios(with_task(config, target_period=3.99), "corner", 1, 20, 0)
+
+
+def test_impossible_wishes_are_refused(config: Config) -> None:
+    with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
+        make_scenarios(config, "paper", 1, 10, -1)
+    with pytest.raises(SuiteError, match="unknown suite 'moon'; known suites: paper, corner, noi"):
+        find_suite("moon")
+
+
+def test_suites_are_known_by_these_names() -> None:
+    names = "paper corner noise payload friction gains latency push fast steep".split()
+    assert set(names) <= set(SUITES)
+    assert all(SUITES[name].summary for name in SUITES)
+
+
+def test_no_seed_serves_two_purposes() -> None:
+    """What a policy is chosen or tuned by must not be what it is judged by."""
+    seeds = dataclasses.astuple(SEEDS)
+    assert len(set(seeds)) == len(seeds) == 6
+
+
+def test_paper_fills_the_disc_and_corner_its_corners(config: Config) -> None:
+    paper = make_scenarios(config, "paper", 400, 60, 0)[0].targets
+    size = np.linalg.norm(paper, axis=-1)
+    assert size.max() <= 7
+    assert np.mean(size) == pytest.approx(3.5, abs=0.15)
+    assert np.abs(paper.mean(axis=(0, 1))).max() < 0.2
+    corner = make_scenarios(config, "corner", 50, 60, 0)[0].targets
+    assert np.all(np.abs(corner) == 7)
+    assert len(np.unique(corner.reshape(-1, 2), axis=0)) == 4
+
+
+def test_authority_and_reach_by_hand(config: Config, robot: Robot) -> None:
+    """15 mm/s over 193 mm, and 61 mm of leg over 335 mm."""
+    assert authority(config) == pytest.approx(np.degrees(0.015 / 0.193))
+    double = with_task(config, action_max=0.006)
+    assert authority(double) == pytest.approx(np.degrees(0.030 / 0.193))
+    slow = with_task(config, ctrl_dt=0.4)
+    assert authority(slow) == pytest.approx(np.degrees(0.0075 / 0.193))
+    reach = greatest_incline(config.task, robot)
+    assert reach == pytest.approx(np.degrees(np.arctan(0.061 / 0.335)), abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("suite", "field", "least", "most"),
+    [
+        ("payload", "payload", 0.0, 5.0),
+        ("friction", "friction", 0.4, 1.0),
+        ("gains", "gain", 0.8, 1.2),
+        ("latency", "latency", 1.0, 1.0),
+    ],
+)
+def test_conditions_fill_their_range(
+    config: Config, suite: str, field: str, least: float, most: float
+) -> None:
+    conditions = make_scenarios(config, suite, 300, 10, 0)[1]
+    values = getattr(conditions, field)
+    margin = 0.03 * (most - least)
+    assert least <= values.min() <= least + margin
+    assert most - margin <= values.max() <= most
+    nominal = make_scenarios(config, "paper", 300, 10, 0)[1]
+    for name in conditions._fields:
+        if name not in (field, "payload_at"):
+            np.testing.assert_array_equal(getattr(conditions, name), getattr(nominal, name))
+
+
+def test_noise_is_that_of_a_data_sheet(config: Config) -> None:
+    sigma = make_scenarios(config, "noise", 3, 10, 0)[1].imu_noise
+    np.testing.assert_array_equal(sigma, np.tile((0.002,) * 3 + (0.023,) * 3, (3, 1)))
+
+
+def test_every_suite_follows_the_configs_incline(config: Config) -> None:
+    flat = with_task(config, max_incline=2.0)
+    for name, suite in SUITES.items():
+        if not suite.steep:
+            assert np.abs(make_scenarios(flat, name, 20, 60, 0)[0].targets).max() <= 2.0
+
+
+def test_loads_and_kicks_go_with_the_robot() -> None:
+    """B2 is 5.493 times as heavy as ours, and 1.702 times as long."""
+    config = fitted(preset("default"), "b2")
+    _, conditions = make_scenarios(config, "payload", 200, 1.0, 0)
+    assert conditions.payload.max() == pytest.approx(5 * 5.493, rel=0.03)
+    assert np.abs(conditions.payload_at[:, :2]).max() == pytest.approx(0.05 * 1.702, rel=0.03)
+    speeds = np.linalg.norm(make_pushes(config, "push", 100, 60.0, 0).kicks, axis=-1)
+    limits = (speeds.min(), speeds.max())
+    assert limits == pytest.approx((0.2 * 1.702, 0.4 * 1.702), rel=0.01)

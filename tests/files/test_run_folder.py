@@ -1,0 +1,326 @@
+"""A run's folder: whole at every moment, refused in one sentence where it cannot be used."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given, settings
+
+from mjx_balance.config import Config, preset, to_dict
+from mjx_balance.files import run_folder
+from mjx_balance.files.run_folder import (
+    RunFolder,
+    RunFolderError,
+    check_same_config,
+    check_same_provenance,
+    create_run_folder,
+    keep_metrics_until,
+    keep_validated_until,
+    locked,
+    read_run_config,
+    write_atomically,
+)
+
+CONFIG = preset("smoke")
+TODAY = {"scene_hash": "abc", "solver_iterations": 4, "versions": {"jax": "0.9", "mujoco": "3.1"}}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    return create_run_folder(tmp_path / "run", CONFIG, TODAY)
+
+
+def test_a_file_is_replaced_only_once_the_new_one_is_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "file.json"
+    file.write_text("old")
+    seen = []
+
+    def fsync(number: int) -> None:
+        seen.append((file.read_text(), (tmp_path / "file.json.part").read_text()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_atomically(file, "new")
+    assert seen == [("old", "new")]
+    assert file.read_text() == "new"
+    assert os.listdir(tmp_path) == ["file.json"]
+    monkeypatch.undo()
+    write_atomically(file, b"\0\xff")
+    assert file.read_bytes() == b"\0\xff"
+
+
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "file.json"
+    file.write_text("old")
+
+    def full(number: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as error:
+        write_atomically(file, "new")
+    assert error.value.filename == str(file), "not a name that nobody has given"
+    assert file.read_text() == "old"
+    assert os.listdir(tmp_path) == ["file.json"]
+
+
+def test_links_are_followed_and_pipes_written_to(tmp_path: Path) -> None:
+    """Neither is replaced: what they stand for is somewhere else."""
+    (tmp_path / "there").mkdir()
+    file, link, pipe = (tmp_path / name for name in ("there/file", "link", "pipe"))
+    link.symlink_to(file)
+    for content in ("first", "second"):
+        write_atomically(link, content)
+        assert link.is_symlink()
+        assert file.read_text() == content
+    assert os.listdir(tmp_path / "there") == ["file"]
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_atomically(pipe, "through")
+    assert os.read(reader, 100) == b"through"
+    os.close(reader)
+    assert pipe.is_fifo()
+    with pytest.raises(OSError, match="directory") as error:
+        write_atomically(tmp_path / "there", "x")
+    assert error.value.filename == str(tmp_path / "there")
+    assert sorted(os.listdir(tmp_path)) == ["link", "pipe", "there"]
+
+
+def test_a_new_folder_has_config_and_provenance_and_nothing_beside_it(folder: RunFolder) -> None:
+    assert json.loads(folder.config.read_text()) == to_dict(CONFIG)
+    assert json.loads(folder.provenance.read_text()) == TODAY
+    assert os.listdir(folder.path.parent) == ["run"]
+    assert read_run_config(folder.path) == CONFIG
+
+
+def test_a_folder_exists_only_once_it_can_be_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if killed between any two writes: the name is not taken yet."""
+
+    class Killed(BaseException):
+        pass
+
+    written = []
+
+    def write(path: Path, values: Any) -> None:
+        assert not (tmp_path / "run").exists()
+        written.append(path.name)
+        if path.name == "provenance.json":
+            raise Killed
+
+    monkeypatch.setattr(run_folder, "write_json", write)
+    with pytest.raises(Killed):
+        create_run_folder(tmp_path / "run", CONFIG, TODAY)
+    assert written == ["config.json", "provenance.json"]
+    assert not (tmp_path / "run").exists()
+    monkeypatch.undo()
+    create_run_folder(tmp_path / "run", CONFIG, TODAY)
+
+
+def test_the_names_are_those_of_the_contract(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    names = "config.json metrics.jsonl tensorboard checkpoints policy.safetensors evaluation.json"
+    assert [
+        folder.config,
+        folder.metrics,
+        folder.tensorboard,
+        folder.checkpoints,
+        folder.policy,
+        folder.evaluation,
+    ] == [tmp_path / name for name in names.split()]
+    assert folder.figures == tmp_path / "figures"
+    assert folder.report == tmp_path / "report.json"
+    assert folder.seeds_summary == tmp_path / "seeds.json"
+    assert folder.seed_policy(3) == tmp_path / "seeds" / "seed-3.safetensors"
+
+
+def test_an_existing_folder_and_an_unwritable_one_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(RunFolderError, match=r"run folder .*mine exists; choose another"):
+        create_run_folder(tmp_path / "mine", CONFIG, TODAY)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunFolderError, match="file/run cannot be written: Not a directory"):
+        create_run_folder(tmp_path / "file" / "run", CONFIG, TODAY)
+    assert sorted(os.listdir(tmp_path)) == ["file", "mine"]
+
+
+def test_one_process_at_a_time_works_on_a_run(folder: RunFolder) -> None:
+    taken = pytest.raises(RunFolderError, match="another process works on the run in")
+    with locked(folder), taken, locked(folder):
+        pass
+    with locked(folder):  # free again
+        pass
+
+
+def test_a_killed_process_leaves_no_lock(folder: RunFolder) -> None:
+    hold = (
+        "import sys, time, pathlib\n"
+        "from mjx_balance.files.run_folder import RunFolder, locked\n"
+        "with locked(RunFolder(pathlib.Path(sys.argv[1]))):\n"
+        "    print('held', flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    command = [sys.executable, "-c", hold, str(folder.path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(RunFolderError, match="another process"), locked(folder):
+            pass
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        with locked(folder):
+            pass
+
+
+def test_a_finished_run_and_no_run_are_told_apart(folder: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(RunFolderError, match=r"is no run folder: it has no config\.json"):
+        read_run_config(tmp_path)
+    folder.evaluation.write_text("{}")
+    with pytest.raises(RunFolderError, match="is finished; start a new one"):
+        read_run_config(folder.path)
+
+
+def test_another_config_is_refused_by_the_name_of_its_field(tmp_path: Path) -> None:
+    check_same_config(CONFIG, preset("smoke"), tmp_path)
+    with pytest.raises(RunFolderError, match=r"was started with seed = 0, not 7"):
+        check_same_config(CONFIG, Config(**{**vars(CONFIG), "seed": 7}), tmp_path)
+
+
+def test_another_scene_or_solver_is_refused(folder: RunFolder) -> None:
+    assert check_same_provenance(folder.path, TODAY) is None
+    with pytest.raises(RunFolderError, match="was started with scene_hash abc, but it is xyz"):
+        check_same_provenance(folder.path, {**TODAY, "scene_hash": "xyz"})
+    with pytest.raises(RunFolderError, match="with solver_iterations 4, but it is 8 today"):
+        check_same_provenance(folder.path, {**TODAY, "solver_iterations": 8})
+    with pytest.raises(RunFolderError, match="with engine None, but it is mjx today"):
+        check_same_provenance(folder.path, {**TODAY, "engine": "mjx"})
+
+
+def test_other_versions_are_said(folder: RunFolder) -> None:
+    said = check_same_provenance(folder.path, {**TODAY, "versions": {"jax": "1", "mujoco": "3.1"}})
+    assert said is not None
+    assert "was started with jax 0.9 (now 1); it goes on" in said
+    assert "mujoco" not in said
+
+
+def test_a_folder_without_provenance_is_refused(folder: RunFolder) -> None:
+    folder.provenance.unlink()
+    with pytest.raises(RunFolderError, match=r"provenance.json cannot be used: No such file"):
+        check_same_provenance(folder.path, TODAY)
+
+
+def test_metrics_are_kept_up_to_the_checkpoint(tmp_path: Path) -> None:
+    log = tmp_path / "metrics.jsonl"
+    keep_metrics_until(log, 5)
+    assert not log.exists()
+    lines = [f'{{"env_steps": {n}}}' for n in (1024, 2048, 3072)]
+    broken = ["[" * 100_000, "3", '{"env_steps": "x"}', '{"env_st', "\udcff"]
+    text = "\n".join([*broken[:2], *lines, *broken[2:]])
+    log.write_bytes(text.encode(errors="surrogateescape"))
+    keep_metrics_until(log, 2048)
+    assert log.read_text() == '{"env_steps": 1024}\n{"env_steps": 2048}\n'
+
+
+def test_validated_policies_of_a_lost_history_are_dropped(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    keep_validated_until(folder.validated, 5)  # none yet
+    assert folder.validated_policy(3, 900) == tmp_path / "validated" / "900" / "seed-3.safetensors"
+    for env_steps in (900, 2_048, 2_049, 10_000):
+        file = folder.validated_policy(0, env_steps)
+        file.parent.mkdir(parents=True)
+        file.write_text("a policy")
+    (folder.validated / "notes").mkdir()
+    keep_validated_until(folder.validated, 2_048)
+    assert {path.name for path in folder.validated.iterdir()} == {"900", "2048", "notes"}
+    assert folder.validated_policy(0, 2_048).is_file()
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=5,
+)
+WHOLE = json.dumps(to_dict(CONFIG)).encode()
+
+
+def fields(values: dict[str, Any], path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Every place in nested dictionaries."""
+    places = []
+    for name, value in values.items():
+        places.append((*path, name))
+        if isinstance(value, dict):
+            places += fields(value, (*path, name))
+    return places
+
+
+@st.composite
+def damaged_configs(draw: st.DrawFn) -> bytes:
+    """A config file with a value of any kind somewhere, or with other bytes."""
+    kind = draw(st.sampled_from(("value", "cut", "flip", "bytes", "deep", "huge")))
+    if kind == "value":
+        values = to_dict(CONFIG)
+        *path, name = draw(st.sampled_from(fields(values)))
+        inner = values
+        for step in path:
+            inner = inner[step]
+        inner[name] = draw(JSON)
+        return json.dumps(values).encode()
+    if kind == "cut":
+        return WHOLE[: draw(st.integers(0, len(WHOLE)))]
+    if kind == "flip":
+        at, mask = draw(st.integers(0, len(WHOLE) - 1)), draw(st.integers(1, 255))
+        return WHOLE[:at] + bytes([WHOLE[at] ^ mask]) + WHOLE[at + 1 :]
+    if kind == "deep":
+        return draw(st.sampled_from((b"[", b'{"task":'))) * draw(st.integers(1, 100_000))
+    if kind == "huge":
+        return b'{"seed": ' + b"9" * draw(st.integers(1, 10_000)) + b"}"
+    return draw(st.binary(max_size=200))
+
+
+def read_damaged(path: Path, content: bytes) -> None:
+    """Reads it as a config: a config, or the reader's own error in one short line."""
+    RunFolder(path).config.write_bytes(content)
+    try:
+        assert isinstance(read_run_config(path), Config)
+    except RunFolderError as error:
+        said = str(error)
+        assert said
+        assert "\n" not in said
+        assert len(said) < 500 + len(str(path))
+
+
+@settings(deadline=None, max_examples=150)
+@given(damaged_configs())
+def test_a_damaged_config_gives_a_sentence(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes
+) -> None:
+    read_damaged(tmp_path_factory.getbasetemp(), content)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.binary(max_size=50) | JSON.map(lambda x: json.dumps(x).encode()))
+def test_a_damaged_provenance_gives_a_sentence(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes
+) -> None:
+    folder = RunFolder(tmp_path_factory.getbasetemp())
+    folder.provenance.write_bytes(content)
+    with pytest.raises(RunFolderError):
+        check_same_provenance(folder.path, TODAY)
+
+
+def test_a_config_of_many_megabytes_is_not_read(folder: RunFolder) -> None:
+    with folder.config.open("r+b") as file:
+        file.truncate(2**31)
+    with pytest.raises(RunFolderError, match=r"2048\.0 MiB long; at most 1 MiB are read"):
+        read_run_config(folder.path)

@@ -1,0 +1,61 @@
+"""The policies in the repository: they load, belong to today's scene, and balance."""
+
+from pathlib import Path
+
+import pytest
+
+from mjx_balance import load_policy
+from mjx_balance.config import Config, preset
+from mjx_balance.evaluation.rollout import evaluate, policy_scene
+from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.sim.scene import Scene
+
+FOLDER = Path(__file__).parents[2] / "policies"
+POLICIES = sorted((*FOLDER.glob("*.safetensors"), *FOLDER.glob("seeds/*.safetensors")))
+"""Of our own robot; test_shipped_robots.py has those of others."""
+
+
+def test_there_is_a_best_policy_and_its_seeds() -> None:
+    names = [path.name for path in POLICIES]
+    assert "best.safetensors" in names
+    best = load_policy(POLICIES[names.index("best.safetensors")])
+    seeds = [load_policy(path) for path in POLICIES if path.name.startswith("seed-")]
+    assert best.fingerprint in {policy.fingerprint for policy in seeds}
+    assert len({policy.fingerprint for policy in seeds}) == len(seeds) == 5
+
+
+@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
+def test_policy_fits_in_the_repository_and_to_the_scene(path: Path) -> None:
+    assert path.stat().st_size < 1_000_000
+    policy = load_policy(path)
+    policy_scene(policy)
+    assert policy.config.task == preset("best").task
+
+
+@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    ("suite", "mean", "most"),
+    [
+        ("corner", 0.12, 1.1),
+        ("noise", 0.12, 1.1),
+        ("payload", 0.12, 1.1),
+        ("latency", 0.3, 2.5),
+        ("push", 0.12, 2.5),
+    ],
+)
+def test_policy_balances(path: Path, suite: str, mean: float, most: float) -> None:
+    """8 scenarios of 20 s; the figures of the README have more of both."""
+    result = evaluate(load_policy(path), suite, 8, 20.0, 11)
+    assert result["falls"] == 0
+    assert result["tilt_deg"]["mean"] < mean
+    assert result["tilt_deg"]["max"] < most
+    assert result["action_mm_settled"] < 0.15
+
+
+def test_scenarios_of_the_check_do_tilt(config: Config, scene: Scene) -> None:
+    """The limits above mean something: these boards take a standing robot down."""
+    from mjx_balance.evaluation.controllers import make_controller
+    from mjx_balance.evaluation.rollout import roll_out
+
+    drawn, _ = make_scenarios(config, "corner", 8, 20.0, 11)
+    assert roll_out(scene, make_controller("none", scene), drawn, 20.0).fell.all()

@@ -1,0 +1,191 @@
+"""What a watcher of a run sees, number by number."""
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from mjx_balance.report import progress as module
+from mjx_balance.report.progress import Display
+
+METRICS = {
+    "perf/env_steps_per_second": 1234.5,
+    "train/tilt_deg": 0.25,
+    "train/falls_per_minute": 0.5,
+    "train/reward": 0.3,
+    "train/loss": 0.01,
+    "train/epsilon": 0.05,
+    "train/not_shown": 77.7,
+}
+CELLS = (
+    "decisions/s 1,234",
+    "mean tilt 0.250 deg",
+    "falls per robot-minute 0.500",
+    "reward 0.300",
+    "loss 0.01000",
+    "epsilon 0.050",
+)
+
+
+class Clock:
+    """A clock that the test winds."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+def screen(terminal: bool) -> tuple[Display, io.StringIO]:
+    out = io.StringIO()
+    return Display(Console(file=out, force_terminal=terminal, width=110)), out
+
+
+def plain(text: str) -> list[str]:
+    """Lines without colours and cursor movements, spaces merged."""
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text).replace("\r", "\n")
+    return [" ".join(line.split()) for line in text.splitlines()]
+
+
+def test_plain_output_is_one_line_per_interval(clock: Clock) -> None:
+    display, out = screen(terminal=False)
+    with display.training(200, 1_200):
+        clock.now += 4.9
+        display.update(300, METRICS)  # too soon
+        clock.now += 5.1
+        display.update(600, METRICS)
+        clock.now += 4.9
+        display.update(700, METRICS)  # too soon after the last
+        clock.now += 0.1
+        display.update(750, METRICS)
+        clock.now += 0.1
+        display.update(1_280, METRICS)  # the last one is always shown
+    numbers = "  ".join(CELLS)
+    assert out.getvalue().splitlines() == [
+        # 400 decisions in 10 s by this call; 600 are left
+        f"      600/1,200 decisions  {numbers}  left 15 s",
+        # 550 in 15 s; 450 are left
+        f"      750/1,200 decisions  {numbers}  left 12 s",
+        f"    1,280/1,200 decisions  {numbers}  left 0 s",
+    ]
+
+
+def test_plain_output_leaves_out_what_is_not_known(clock: Clock) -> None:
+    display, out = screen(terminal=False)
+    with display.training(0, 10):
+        clock.now += 5.0
+        display.update(10, {"train/reward": -0.5})
+    assert out.getvalue().split("decisions")[1].split() == ["reward", "-0.500", "left", "0", "s"]
+
+
+VALIDATED = {
+    "eval/paper/tilt_mean": 0.0844,
+    "eval/paper/falls": 0.0,
+    "eval/corner/tilt_mean": 1.25,
+    "eval/corner/falls": 2.5,
+}
+HELD_OUT = ("held out, paper 0.084 deg, falls 0", "held out, corner 1.250 deg, falls 2.5")
+
+
+def test_a_validation_is_shown_until_the_next_one(clock: Clock) -> None:
+    """Behind the other numbers, and not before there is one; nothing else is shown for longer."""
+    display, out = screen(terminal=False)
+    with display.training(0, 400):
+        for done, metrics in (
+            (100, {"train/loss": 1.0}),
+            (200, {"train/reward": 1.0} | VALIDATED),
+            (300, {"train/epsilon": 0.5}),
+            (400, {"train/epsilon": 0.5} | VALIDATED | {"eval/paper/falls": 1.0}),
+        ):
+            clock.now += 10
+            display.update(done, metrics)
+    shown = [line.split("decisions  ")[1] for line in out.getvalue().splitlines()]
+    numbers = "  ".join(HELD_OUT)
+    assert shown == [
+        "loss 1.00000  left 30 s",
+        f"reward 1.000  {numbers}  left 20 s",
+        f"epsilon 0.500  {numbers}  left 10 s",
+        f"epsilon 0.500  {numbers.replace('falls 0', 'falls 1')}  left 0 s",
+    ]
+
+
+def test_a_terminal_shows_a_validation_in_a_row_of_its_own() -> None:
+    display, out = screen(terminal=True)
+    with display.training(200, 1_000):
+        display.update(600, METRICS | VALIDATED)
+        display.update(800, METRICS)
+    lines = [line.strip("│ ") for line in plain(out.getvalue())]
+    last = len(lines) - 1 - lines[::-1].index(next(x for x in lines if "mjx_balance" in x))
+    assert lines[last + 2 : last + 5] == [" ".join(x) for x in (CELLS[:3], CELLS[3:], HELD_OUT)]
+
+
+def test_a_phase_says_what_is_done_and_how_long_it_took(clock: Clock) -> None:
+    display, out = screen(terminal=False)
+    with display.phase("compiling"):
+        clock.now += 2.46
+    assert out.getvalue().splitlines() == ["compiling ...", "compiling: 2.5 s"]
+    display, out = screen(terminal=True)
+    with display.phase("compiling"):
+        clock.now += 61.0
+    assert plain(out.getvalue())[-1] == "compiling: 61.0 s"
+
+
+def test_a_terminal_shows_every_number_under_its_name() -> None:
+    display, out = screen(terminal=True)
+    with display.training(200, 1_000):
+        display.update(800, METRICS)
+    lines = [line.strip("│ ") for line in plain(out.getvalue())]
+    panel = lines[
+        len(lines) - 1 - lines[::-1].index(next(x for x in lines if "mjx_balance" in x)) :
+    ]
+    assert panel[2] == " ".join(CELLS[:3])
+    assert panel[3] == " ".join(CELLS[3:])
+    assert "training" in panel[1]
+    assert "800/1000 decisions" in panel[1]
+
+
+def test_a_terminal_shows_a_dash_before_the_first_numbers_and_no_more_than_all() -> None:
+    display, out = screen(terminal=True)
+    with display.training(200, 1_000):
+        pass
+    text = " ".join(plain(out.getvalue()))
+    assert "200/1000 decisions" in text
+    assert "decisions/s - mean tilt - falls per robot-minute -" in text
+    display, out = screen(terminal=True)
+    with display.training(0, 1_000):
+        display.update(1_024, METRICS)
+    assert "1000/1000 decisions" in " ".join(plain(out.getvalue()))
+
+
+def test_a_bar_moves_to_the_share_that_is_done() -> None:
+    display, out = screen(terminal=False)
+    with display.bar("evaluating") as bar:
+        bar(0.5)
+    assert out.getvalue() == "evaluating ...\n"
+    display, out = screen(terminal=True)
+    with display.bar("evaluating") as bar:
+        bar(0.25)
+        assert bar._progress is not None
+        assert bar._progress.tasks[0].percentage == 25.0
+        bar._progress.refresh()
+    assert "evaluating" in out.getvalue()
+
+
+def test_messages_are_printed_as_they_are() -> None:
+    display, out = screen(terminal=False)
+    message = "a path /[bold]" + "x" * 120
+    display.say(message)
+    assert out.getvalue() == f"{message}\n", "neither wrapped nor taken for markup"
+    display, out = screen(terminal=True)
+    with display.bar("evaluating [bold]"):
+        pass
+    assert "[bold]" in "".join(plain(out.getvalue()))
