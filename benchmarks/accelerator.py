@@ -86,7 +86,7 @@ def rates(engine: str, sizes: list[int]) -> None:
         config, learner = sized(engine, num_envs)
 
         def act(obs: Any, network: Any = learner.network) -> Any:
-            return network.apply({"params": params}, obs, method="head").greedy()
+            return network.apply({"params": params}, obs, method="head").argmax()
 
         iterations = max(1, DECISIONS_PER_CALL[kind()] // num_envs)
         state = learner.init(0).env_state

@@ -275,7 +275,7 @@ class Learner:
         """Takes one decision of each of this device's envs."""
         obs = array(state.env_state.obs)
         with jax.named_scope("acting"):
-            greedy = self._q_values(self._folded(state.params, state.inputs), obs).greedy()
+            greedy = self._q_values(self._folded(state.params, state.inputs), obs).argmax()
             keys = jax.random.split(device_key(key_act), len(obs))
             levels = self.config.exploration_noise
             act = partial(explore, factors=self.action_factors, levels=levels)

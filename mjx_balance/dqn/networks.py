@@ -34,7 +34,7 @@ class QNetwork(nn.Module):
 
     def __call__(self, obs: jax.Array) -> jax.Array:
         """Maps obs (..., obs_size) to action values (..., prod(factors))."""
-        return self.head(obs).every()
+        return self.head(obs).q_values()
 
     @nn.compact
     def head(self, obs: jax.Array) -> heads.Head:

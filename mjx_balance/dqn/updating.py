@@ -84,10 +84,10 @@ def loss(
     chooses the a that q' values (Double DQN, van Hasselt et al. 2015,
     https://arxiv.org/abs/1509.06461, Eq. 4).
     """
-    q_tm1 = q_values(params, batch.obs).of(batch.action)
+    q_tm1 = q_values(params, batch.obs).q_value(batch.action)
     target = q_values(target_params, batch.next_obs)
     selector = q_values(params, batch.next_obs) if config.double else target
-    q_t = target.of(selector.greedy())
+    q_t = target.q_value(selector.argmax())
     discount_t = config.gamma * (1 - batch.terminated)
     error = batch.reward + discount_t * q_t - q_tm1
     if config.huber_delta is None:

@@ -106,11 +106,11 @@ class Policy:
         Raises:
           ValueError: if obs has another size.
         """
-        return self._head(obs).every()
+        return self._head(obs).q_values()
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """Index of the best action: () for (obs_size,), (batch,) for (batch, obs_size)."""
-        return self._head(obs).greedy()
+        return self._head(obs).argmax()
 
     def _head(self, obs: np.ndarray) -> heads.Head:
         obs = x = np.asarray(obs, np.float32)

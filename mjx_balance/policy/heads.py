@@ -23,7 +23,7 @@ class Added:
     factors: tuple[int, ...]
     """Numbers of digits."""
 
-    def every(self) -> Any:
+    def q_values(self) -> Any:
         """Values of all actions, (..., prod(factors))."""
         values, *others = self._split()
         for branch in others:
@@ -31,14 +31,14 @@ class Added:
             values = values.reshape(*values.shape[:-2], math.prod(values.shape[-2:]))
         return values
 
-    def of(self, action: Any) -> Any:
+    def q_value(self, action: Any) -> Any:
         """Values (...) of action indices (...)."""
         xp = self.branches.__array_namespace__()
         digits = xp.unravel_index(action, self.factors)
         pairs = zip(self._split(), digits, strict=True)
         return sum(xp.take_along_axis(x, digit[..., None], axis=-1)[..., 0] for x, digit in pairs)
 
-    def greedy(self) -> Any:
+    def argmax(self) -> Any:
         """Indices (...) of the best actions: the best digit of every factor."""
         xp = self.branches.__array_namespace__()
         return _index([xp.argmax(branch, axis=-1) for branch in self._split()], self.factors)
@@ -66,13 +66,13 @@ class Radial:
     factors: tuple[int, ...]
     """Numbers of points on each axis."""
 
-    def every(self) -> Any:
+    def q_values(self) -> Any:
         """Values of all actions, (..., prod(factors))."""
-        return Radial(self.out[..., None, :], self.profile, self.stretch, self.factors).of(
+        return Radial(self.out[..., None, :], self.profile, self.stretch, self.factors).q_value(
             np.arange(math.prod(self.factors))
         )
 
-    def of(self, action: Any) -> Any:
+    def q_value(self, action: Any) -> Any:
         """Values (...) of action indices (...)."""
         xp = self.out.__array_namespace__()
         alpha, beta, kappa, delta = xp.logaddexp(self.profile, xp.zeros_like(self.profile))
@@ -80,7 +80,7 @@ class Radial:
         z = xp.sqrt(delta**2 + xp.sum((away * xp.exp(self.stretch)) ** 2, axis=-1))
         return self.out[..., 0] + alpha * xp.exp(-beta * z) - kappa * z
 
-    def greedy(self) -> Any:
+    def argmax(self) -> Any:
         """Indices (...) of the best actions: on every axis, the point nearest to mu."""
         xp = self.out.__array_namespace__()
         last = np.asarray(self.factors, np.float32) - 1

@@ -106,9 +106,9 @@ def test_heads_give_numpy_and_jax_the_same(batch: tuple[int, ...]) -> None:
     for plain in some_heads(batch, 3):
         traced = in_jax(plain)
         for a, b in (
-            (plain.every(), traced.every()),
-            (plain.of(action), traced.of(jnp.asarray(action))),
-            (plain.greedy(), traced.greedy()),
+            (plain.q_values(), traced.q_values()),
+            (plain.q_value(action), traced.q_value(jnp.asarray(action))),
+            (plain.argmax(), traced.argmax()),
         ):
             assert not isinstance(a, jax.Array)
             assert isinstance(b, jax.Array)
@@ -124,12 +124,12 @@ def test_value_of_one_action_and_the_best_one_are_those_of_all_values(
     best = set()
     for seed in range(5):
         for head in some_heads(batch, seed):
-            every = head.every()
-            assert every.shape == (*batch, 24)
-            wanted = np.take_along_axis(every, action[..., None], axis=-1)[..., 0]
-            np.testing.assert_allclose(head.of(action), wanted, rtol=1e-6, atol=1e-6)
-            np.testing.assert_array_equal(head.greedy(), every.argmax(axis=-1))
-            best |= set(np.ravel(head.greedy()).tolist())
+            values = head.q_values()
+            assert values.shape == (*batch, 24)
+            expected = np.take_along_axis(values, action[..., None], axis=-1)[..., 0]
+            np.testing.assert_allclose(head.q_value(action), expected, rtol=1e-6, atol=1e-6)
+            np.testing.assert_array_equal(head.argmax(), values.argmax(axis=-1))
+            best |= set(np.ravel(head.argmax()).tolist())
     assert not batch or len(best) > 15, "some of them inside the grid, some on its edge"
 
 
@@ -139,9 +139,9 @@ def test_what_is_not_a_number_is_worth_an_action_all_the_same() -> None:
         name = "branches" if isinstance(head, heads.Added) else "out"
         array = vars(head)[name].copy()
         array[0] = np.nan
-        greedy = type(head)(**vars(head) | {name: array}).greedy()
-        assert 0 <= greedy[0] < 24
-        assert greedy[1] == head.greedy()[1]
+        best = type(head)(**vars(head) | {name: array}).argmax()
+        assert 0 <= best[0] < 24
+        assert best[1] == head.argmax()[1]
 
 
 def test_points_of_the_radial_head_follow_the_index() -> None:
