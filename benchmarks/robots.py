@@ -23,7 +23,7 @@ from PIL import Image, ImageDraw
 from throughput import hardware
 
 from mjx_balance import load_policy
-from mjx_balance.cli.inspection import tilted
+from mjx_balance.cli.inspection import tilt_board
 from mjx_balance.evaluation.controllers import make_controller
 from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
 from mjx_balance.evaluation.suites import SEEDS
@@ -98,7 +98,7 @@ def gallery(policies: dict[str, Path], out: Path) -> None:
     with tempfile.TemporaryDirectory() as work:
         for k, (name, path) in enumerate(policies.items()):
             scene, one = policy_scene(load_policy(path)), Path(work) / f"{name}.png"
-            render.write(one, scene.config, tilted(scene).qpos[None])
+            render.write(one, scene.config, tilt_board(scene).qpos[None])
             corner = (k % 3 * THUMB[0], k // 3 * THUMB[1])
             with Image.open(one) as picture:
                 sheet.paste(picture.convert("RGB").resize(THUMB), corner)

@@ -15,15 +15,15 @@ from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
 
-MOST_CREEP = 0.01
+MAX_CREEP = 0.01
 """Of a robot that stands still, m/s."""
-SPENT = 0.99
+NO_TORQUE_LEFT = 0.99
 """Share of its torque from which a servo has none left."""
-MOVING, WAITING = 3.0, 1.0
+TILT_SECONDS, REST_SECONDS = 3.0, 1.0
 """Time to turn the board, and to watch the robot at rest then, s."""
 
 
-class Tilted(NamedTuple):
+class TiltTest(NamedTuple):
     """A robot that its legs keep level on a board held at the greatest incline on both axes.
 
     The worst of four: the board turned either way about each axis.
@@ -39,7 +39,7 @@ class Tilted(NamedTuple):
     """(nq,) at the end, where a servo has most to do."""
 
 
-def find_out(robot: str) -> tuple[Scene, Tilted]:
+def inspect(robot: str) -> tuple[Scene, TiltTest]:
     """Builds a robot's scene and tilts it.
 
     Args:
@@ -50,13 +50,13 @@ def find_out(robot: str) -> tuple[Scene, Tilted]:
     """
     config = check(fitted(preset("default"), robot))
     scene = load_scene(config)
-    return scene, tilted(scene)
+    return scene, tilt_board(scene)
 
 
-def tilted(scene: Scene) -> Tilted:
+def tilt_board(scene: Scene) -> TiltTest:
     """Turns the board to `max_incline` on both axes, the body kept level by geometry alone."""
-    found = [_tilted(scene, np.asarray(ways)) for ways in itertools.product((1, -1), repeat=2)]
-    return Tilted(
+    found = [_tilt_board(scene, np.asarray(ways)) for ways in itertools.product((1, -1), repeat=2)]
+    return TiltTest(
         torque_share=np.max([one.torque_share for one in found], axis=0),
         tilt=max(one.tilt for one in found),
         creep=max(one.creep for one in found),
@@ -64,18 +64,18 @@ def tilted(scene: Scene) -> Tilted:
     )
 
 
-def _tilted(scene: Scene, ways: np.ndarray) -> Tilted:
+def _tilt_board(scene: Scene, ways: np.ndarray) -> TiltTest:
     """With the board turned one way, (2,) +-1 about its X and Y."""
     model, task, robot = scene.model, scene.config.task, scene.robot
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = scene.stance.qpos, scene.stance.qvel
     slope = math.tan(math.radians(task.max_incline))
     rise = slope * (ways[0] * robot.each("y") - ways[1] * robot.each("x"))
-    steps = round(MOVING / task.sim_dt)
+    steps = round(TILT_SECONDS / task.sim_dt)
     angle = math.radians(task.max_incline)
     root = scene.trunk_quat[0] - 3
     rested = data.qpos[root : root + 3].copy()
-    for k in range(steps + round(WAITING / task.sim_dt)):
+    for k in range(steps + round(REST_SECONDS / task.sim_dt)):
         share = min(1.0, (k + 1) / steps)
         data.ctrl[scene.board_ctrl] = share * angle * ways
         heights = task.body_height - share * rise
@@ -84,24 +84,25 @@ def _tilted(scene: Scene, ways: np.ndarray) -> Tilted:
         if k == steps:
             rested = data.qpos[root : root + 3].copy()
     limits = model.actuator_forcerange[scene.leg_ctrl, 1]
-    return Tilted(
+    return TiltTest(
         torque_share=np.abs(data.actuator_force[scene.leg_ctrl]) / limits,
         tilt=float(body_tilt(data.qpos[scene.trunk_quat])),
-        creep=float(np.linalg.norm(data.qpos[root : root + 3] - rested)) / WAITING,
+        creep=float(np.linalg.norm(data.qpos[root : root + 3] - rested)) / REST_SECONDS,
         qpos=data.qpos.copy(),
     )
 
 
-def shortcomings(scene: Scene, at_tilt: Tilted) -> list[str]:
+def problems(scene: Scene, tilt_test: TiltTest) -> list[str]:
     """Why it is not ready to be trained, a sentence each; empty if it is."""
     task, found = scene.config.task, []
-    if at_tilt.tilt > task.fail_tilt:
+    if tilt_test.tilt > task.fail_tilt:
         found.append(
             f"robot {scene.robot.name} does not hold itself level at {task.max_incline:g} deg on "
-            f"both axes: its body tilts to {at_tilt.tilt:.1f} deg, and {task.fail_tilt:g} is a fall"
+            f"both axes: its body tilts to {tilt_test.tilt:.1f} deg, and {task.fail_tilt:g} is a "
+            "fall"
         )
-    joint, share = _most_loaded(scene, at_tilt)
-    if share >= SPENT:
+    joint, share = _most_loaded(scene, tilt_test)
+    if share >= NO_TORQUE_LEFT:
         found.append(
             f"robot {scene.robot.name} has no torque left at {task.max_incline:g} deg on both "
             f"axes: {joint!r} takes {100 * share:.0f}% of its own"
@@ -109,13 +110,13 @@ def shortcomings(scene: Scene, at_tilt: Tilted) -> list[str]:
     return found
 
 
-def _most_loaded(scene: Scene, at_tilt: Tilted) -> tuple[str, float]:
+def _most_loaded(scene: Scene, tilt_test: TiltTest) -> tuple[str, float]:
     """The servo, and the share of its torque that it takes; of mirror images, the first."""
-    leg, joint = np.unravel_index(np.argmax(at_tilt.torque_share.round(3)), (4, 3))
-    return scene.robot.legs[leg].joints[joint], float(at_tilt.torque_share.max())
+    leg, joint = np.unravel_index(np.argmax(tilt_test.torque_share.round(3)), (4, 3))
+    return scene.robot.legs[leg].joints[joint], float(tilt_test.torque_share.max())
 
 
-def described(scene: Scene, at_tilt: Tilted) -> list[str]:
+def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
     """What was found, line by line."""
     robot, config = scene.robot, scene.config
     low, high = robot.height_range
@@ -128,7 +129,7 @@ def described(scene: Scene, at_tilt: Tilted) -> list[str]:
         *_legs(robot),
         "",
         *_abilities(config, robot),
-        *_standing(scene, at_tilt),
+        *_standing(scene, tilt_test),
     ]
     return lines
 
@@ -161,17 +162,17 @@ def _abilities(config: Config, robot: Robot) -> list[str]:
     ]
 
 
-def _standing(scene: Scene, at_tilt: Tilted) -> list[str]:
-    joint, share = _most_loaded(scene, at_tilt)
+def _standing(scene: Scene, tilt_test: TiltTest) -> list[str]:
+    joint, share = _most_loaded(scene, tilt_test)
     unlimited = UNLIMITED in (scene.robot.hip_torque, scene.robot.knee_torque)
-    slow = at_tilt.creep < MOST_CREEP
-    still = "stands still" if slow else f"slides by {1000 * at_tilt.creep:.0f} mm/s"
+    slow = tilt_test.creep < MAX_CREEP
+    still = "stands still" if slow else f"slides by {1000 * tilt_test.creep:.0f} mm/s"
     incline = scene.config.task.max_incline
     loaded = f"the most loaded servo, {joint}, takes {100 * share:.0f}% of its torque"
     if unlimited:
         loaded = "its model limits no torque: say hip_torque and knee_torque, in N m"
     return [
-        f"at {incline:g} deg on both axes it {still}, level to {at_tilt.tilt:.2f} deg; {loaded}",
+        f"at {incline:g} deg on both axes it {still}, level to {tilt_test.tilt:.2f} deg; {loaded}",
     ]
 
 

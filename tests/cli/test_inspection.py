@@ -9,18 +9,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_balance.cli.inspection import Tilted, described, find_out, shortcomings, tilted
+from mjx_balance.cli.inspection import TiltTest, describe, inspect, problems, tilt_board
 from mjx_balance.config import ConfigError
 from mjx_balance.robots.measure import UNLIMITED
 from mjx_balance.sim.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def spot() -> tuple[Scene, Tilted]:
-    return find_out("spot")
+def spot() -> tuple[Scene, TiltTest]:
+    return inspect("spot")
 
 
-def test_the_tilted_robot_is_where_geometry_puts_it(spot: tuple[Scene, Tilted]) -> None:
+def test_the_tilted_robot_is_where_geometry_puts_it(spot: tuple[Scene, TiltTest]) -> None:
     """The board at 7 deg on both axes, all feet on it, the body level."""
     scene, got = spot
     data = mujoco.MjData(scene.model)
@@ -35,17 +35,17 @@ def test_the_tilted_robot_is_where_geometry_puts_it(spot: tuple[Scene, Tilted]) 
     assert got.creep < 0.005
 
 
-def test_torques_are_shares_of_the_limits(spot: tuple[Scene, Tilted]) -> None:
+def test_torques_are_shares_of_the_limits(spot: tuple[Scene, TiltTest]) -> None:
     """With limits twice as high, half the shares."""
     scene, got = spot
     strong = dataclasses.replace(scene, model=scene.model.__copy__())
     strong.model.actuator_forcerange[scene.leg_ctrl] *= 2
-    np.testing.assert_allclose(tilted(strong).torque_share, got.torque_share / 2, atol=1e-9)
+    np.testing.assert_allclose(tilt_board(strong).torque_share, got.torque_share / 2, atol=1e-9)
     assert 0.05 < got.torque_share.max() < 1
 
 
-def test_what_is_said_of_a_robot(spot: tuple[Scene, Tilted]) -> None:
-    lines = described(*spot)
+def test_what_is_said_of_a_robot(spot: tuple[Scene, TiltTest]) -> None:
+    lines = describe(*spot)
     assert lines[0] == "spot: 50.34 kg, of which the trunk 32.86"
     assert lines[1] == "stands at 542 mm; its legs reach from 176 mm to 691 mm"
     assert "limits 135.278 N m (abduction, hip), 135.278 N m (knee)" in lines[2]
@@ -64,23 +64,23 @@ def test_what_is_said_of_a_robot(spot: tuple[Scene, Tilted]) -> None:
     )
     assert share
     assert int(share[1]) == round(100 * spot[1].torque_share.max())
-    sliding = described(spot[0], spot[1]._replace(creep=0.023))[11]
+    sliding = describe(spot[0], spot[1]._replace(creep=0.023))[11]
     assert "slides by 23 mm/s" in sliding
 
 
 def test_signs_and_bends_are_said() -> None:
-    scene, got = find_out("mini_cheetah")
-    assert "knee backward; +FL_hip_joint -FL_thigh_joint -FL_calf_joint" in described(scene, got)[4]
+    scene, got = inspect("mini_cheetah")
+    assert "knee backward; +FL_hip_joint -FL_thigh_joint -FL_calf_joint" in describe(scene, got)[4]
 
 
-def leaning(folder: Path, y: float) -> tuple[Scene, Tilted]:
+def leaning(folder: Path, y: float) -> tuple[Scene, TiltTest]:
     """Our robot with its trunk's weight off to one side."""
     spec = bodies.our_spec()
     spec.body("trunk").ipos = [0.02, y, 0]
     spec.compile()
     (folder / "model.xml").write_text(spec.to_xml())
     (folder / "maker.toml").write_text(bodies.file_text(Path("model.xml")))
-    return find_out(str(folder / "maker.toml"))
+    return inspect(str(folder / "maker.toml"))
 
 
 def test_the_board_is_turned_every_way(tmp_path: Path) -> None:
@@ -92,39 +92,39 @@ def test_the_board_is_turned_every_way(tmp_path: Path) -> None:
     assert one.creep == pytest.approx(other.creep, abs=1e-3)
 
 
-def test_what_does_not_hold_is_said(spot: tuple[Scene, Tilted]) -> None:
+def test_what_does_not_hold_is_said(spot: tuple[Scene, TiltTest]) -> None:
     """Falling begins at 6 deg; a servo at its limit holds no more."""
     scene, got = spot
-    assert shortcomings(scene, got) == []
+    assert problems(scene, got) == []
     fallen = got._replace(tilt=6.2)
-    assert shortcomings(scene, fallen) == [
+    assert problems(scene, fallen) == [
         "robot spot does not hold itself level at 7 deg on both axes: its body tilts to 6.2 deg, "
         "and 6 is a fall"
     ]
     share = np.zeros((4, 3))
     share[2, 1] = 0.995
-    spent = shortcomings(scene, got._replace(torque_share=share))
+    spent = problems(scene, got._replace(torque_share=share))
     assert len(spent) == 1
     assert "no torque left at 7 deg on both axes: 'RL_thigh_joint' takes" in spent[0]
 
 
-def test_torques_that_nobody_limits_are_asked_for(spot: tuple[Scene, Tilted]) -> None:
+def test_torques_that_nobody_limits_are_asked_for(spot: tuple[Scene, TiltTest]) -> None:
     scene, got = spot
     robot = dataclasses.replace(scene.robot, knee_torque=UNLIMITED)
-    line = described(dataclasses.replace(scene, robot=robot), got)[11]
+    line = describe(dataclasses.replace(scene, robot=robot), got)[11]
     assert "its model limits no torque: say hip_torque and knee_torque, in N m" in line
     assert "%" not in line
 
 
-def test_places_are_seen_from_the_trunks_origin(spot: tuple[Scene, Tilted]) -> None:
+def test_places_are_seen_from_the_trunks_origin(spot: tuple[Scene, TiltTest]) -> None:
     """Though it lies behind the hind legs."""
     scene, got = spot
     legs = [dataclasses.replace(leg, x=leg.x + 0.4) for leg in scene.robot.legs]
     robot = dataclasses.replace(scene.robot, legs=tuple(legs))
-    lines = described(dataclasses.replace(scene, robot=robot), got)
+    lines = describe(dataclasses.replace(scene, robot=robot), got)
     assert "RL  hind left   foot 102 mm ahead, 166 mm to the left" in lines[6]
 
 
 def test_what_cannot_be_built_is_said() -> None:
     with pytest.raises(ConfigError, match="robot is 'rex'"):
-        find_out("rex")
+        inspect("rex")

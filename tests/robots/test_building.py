@@ -307,9 +307,9 @@ def test_a_board_that_is_too_small(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [*MAKERS, "quadruped"])
 def test_feet_hold_as_well_as_ours(name: str) -> None:
     """Regularised friction lets every robot creep; a light body for a foot, twice as fast."""
-    from mjx_balance.cli.inspection import tilted
+    from mjx_balance.cli.inspection import tilt_board
 
-    assert tilted(scene_of(name)).creep < 0.005
+    assert tilt_board(scene_of(name)).creep < 0.005
 
 
 def test_config_follows_the_robot() -> None:

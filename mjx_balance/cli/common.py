@@ -1,0 +1,65 @@
+"""What several commands share."""
+
+import sys
+from pathlib import Path
+
+from mjx_balance.config import check, fitted, preset
+from mjx_balance.errors import USAGE_ERROR, InputError
+from mjx_balance.evaluation import rollout
+from mjx_balance.evaluation.controllers import Controller, ControllerError, make_controller
+from mjx_balance.policy.file import load_policy
+from mjx_balance.sim.scene import Scene, load_scene
+
+HELP = ("-h", "--help")
+
+
+def complain(message: str, code: int = USAGE_ERROR) -> int:
+    """Prints an error message; returns the exit code."""
+    print(f"mjx-balance: {message}", file=sys.stderr)
+    return code
+
+
+def check_out(name: str, path: Path | None, suffix: str = "") -> None:
+    """Refuses an output file that cannot be written, before the work begins.
+
+    Args:
+      name: of the flag.
+      path: given by the user; None passes.
+      suffix: that the file's name must have.
+
+    Raises:
+      InputError: if the name has another suffix, or the folder does not exist.
+    """
+    if path is None:
+        return
+    if suffix and path.suffix != suffix:
+        raise InputError(f"{name} is {path}; its name must end in {suffix}")
+    if path.is_dir():
+        raise InputError(f"cannot write {path}: it is a folder")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"cannot write {path}: its folder does not exist")
+
+
+def load_controller(
+    policy: Path | None, baseline: str | None, robot: str | None
+) -> tuple[Scene, Controller]:
+    """Loads a policy or builds a baseline, with its scene.
+
+    Args:
+      policy: file, run folder or name of a shipped policy.
+      baseline: name of a controller; exactly one of the two is given.
+      robot: of the baseline, or where the policy's robot is found on this machine.
+
+    Raises:
+      ControllerError: if both or neither of policy and baseline are given.
+      PolicyError: if the policy cannot be used.
+      ConfigError: if there is no such robot.
+    """
+    if (policy is None) == (baseline is None):
+        raise ControllerError("name a policy file or --controller NAME, one of the two")
+    if policy is not None:
+        loaded = load_policy(policy)
+        return rollout.policy_scene(loaded, robot=robot), rollout.observing(loaded)
+    assert baseline is not None
+    scene = load_scene(check(fitted(preset("default"), robot or "quadruped")))
+    return scene, make_controller(baseline, scene)

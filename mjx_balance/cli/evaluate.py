@@ -1,0 +1,84 @@
+"""`mjx-balance evaluate`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from mjx_balance.cli.common import check_out, complain, load_controller
+from mjx_balance.errors import FAILED
+from mjx_balance.evaluation.controllers import Controller
+from mjx_balance.evaluation.rollout import run_suite, summarize
+from mjx_balance.files.run_folder import write_json
+from mjx_balance.report.progress import Display
+from mjx_balance.sim.scene import Scene
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateArgs:
+    """Evaluate an exported policy in plain MuJoCo on all cores. Needs no JAX."""
+
+    policy: Annotated[Path | None, tyro.conf.Positional] = None
+    """Policy file, run folder, or the name of a shipped policy."""
+    controller: str | None = None
+    """Baseline to evaluate instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
+    robot: str | None = None
+    """Robot of the baseline; of a policy, where its robot's file is now."""
+    suite: str = "paper"
+    """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast or
+    steep."""
+    scenarios: int = 256
+    """How many of them."""
+    duration: float = 60.0
+    """Length of each, s."""
+    seed: int = 0
+    """Seed that draws them."""
+    json: Path | None = None
+    """File to write the figures to."""
+    video: Path | None = None
+    """MP4 to write of the first scenario."""
+
+
+def evaluate(argv: list[str]) -> int:
+    args = tyro.cli(EvaluateArgs, args=argv, prog="mjx-balance evaluate")
+    from mjx_balance.report.tables import evaluation_table
+
+    display = Display(Console(stderr=True))
+    check_out("json", args.json)
+    check_out("video", args.video, ".mp4")
+    scene, controller = load_controller(args.policy, args.controller, args.robot)
+    with display.bar(f"evaluating, suite {args.suite}") as bar:
+        rollout = run_suite(
+            scene,
+            controller,
+            args.suite,
+            args.scenarios,
+            args.duration,
+            args.seed,
+            bar,
+        )
+    result = summarize(rollout, args.suite, args.duration, args.seed)
+    Console().print(evaluation_table({args.suite: result}))
+    speed = result["physics_steps_per_second"]
+    print(f"{speed:,.0f} physics steps per second", flush=True)
+    if args.json:
+        write_json(args.json, result)
+    if args.video:
+        return _video(scene, controller, args)
+    return 0
+
+
+def _video(scene: Scene, controller: Controller, args: EvaluateArgs) -> int:
+    from mjx_balance.render import drawing as render
+
+    assert args.video is not None
+    rollout = run_suite(scene, controller, args.suite, 1, args.duration, args.seed, record=True)
+    assert rollout.qpos is not None
+    try:
+        render.write(args.video, scene.config, rollout.qpos[0])
+    except render.RenderError as error:
+        return complain(f"no video written: {error}", FAILED)
+    print(f"video of the first scenario: {args.video}")
+    return 0

@@ -1,0 +1,39 @@
+"""`mjx-balance report`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from mjx_balance.cli.common import check_out, complain
+from mjx_balance.report.progress import Display
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportArgs:
+    """Write one HTML page about runs: tables, curves, envelope, video. Needs no JAX."""
+
+    run_dirs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Run folders; the first with a policy is shown beside the baselines."""
+    out: Path | None = None
+    """File to write; none: report.html in the first folder."""
+    scenarios: int = 64
+    """Scenarios per suite and controller."""
+
+
+def report(argv: list[str]) -> int:
+    args = tyro.cli(ReportArgs, args=argv, prog="mjx-balance report")
+    from mjx_balance.report.page import write_report
+
+    if not args.run_dirs:
+        return complain("name at least one run folder")
+    check_out("out", args.out)
+    out = args.out or args.run_dirs[0] / "report.html"
+    display = Display(Console(stderr=True))
+    missing = write_report(args.run_dirs, out, args.scenarios, display.bar)
+    for sentence in missing:
+        complain(sentence)
+    print(out)
+    return 0

@@ -1,0 +1,120 @@
+"""`mjx-balance train` and `mjx-balance sweep`."""
+
+import dataclasses
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from mjx_balance.cli.common import HELP, complain
+from mjx_balance.config import Config, fitted, preset
+from mjx_balance.errors import FAILED, INTERRUPTED, how_to_install
+from mjx_balance.files.run_folder import read_run_config
+from mjx_balance.policy.file import PolicyError
+from mjx_balance.quiet import quiet_imports
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainArgs:
+    """Train a policy in MJX, export it and evaluate it in plain MuJoCo."""
+
+    run_dir: Path | None = None
+    """Folder to create for the run; none: runs/PRESET-SEED-TIME."""
+    resume: Path | None = None
+    """Run folder to continue instead."""
+    profile: bool = False
+    """Trace a call of the training program, and tell what share of it each part takes."""
+    distributed: bool = False
+    """Be one of several processes, on one machine or many, that Slurm, Open MPI or Kubernetes has
+    started; or one that the next three flags place. All get the same other flags."""
+    coordinator: str | None = None
+    """HOST:PORT at which process 0 listens, where no cluster says so."""
+    process_id: int | None = None
+    """Number of this process, from 0."""
+    num_processes: int | None = None
+    """How many there are."""
+    config: tyro.conf.OmitArgPrefixes[Config] = dataclasses.field(default_factory=Config)
+
+
+@dataclasses.dataclass(frozen=True)
+class StartingPoint:
+    """The flags that the defaults of all others depend on."""
+
+    preset: str = "default"
+    robot: str = "quadruped"
+    resume: Path | None = None
+
+
+def sweep(argv: list[str]) -> int:
+    """Runs `mjx-balance sweep gamma=0.1,0.4 @FILE ... [flags of train]`, a train with `--sweep`."""
+    count = next((k for k, text in enumerate(argv) if text.startswith("-")), len(argv))
+    entries = []
+    for text in argv[:count]:
+        if not text.startswith("@"):
+            entries.append(text)
+            continue
+        try:
+            entries += Path(text[1:]).read_text().split()
+        except (OSError, UnicodeDecodeError) as error:
+            return complain(f"the values in {text[1:]} cannot be read: {error}")
+    if not entries and not {"--resume", *HELP} & set(argv):
+        return complain(
+            "say what to try, as gamma=0.1,0.4, or @FILE with such entries, before train's flags"
+        )
+    return train([*argv[count:], *(["--sweep", *entries] if entries else [])])
+
+
+def train(argv: list[str]) -> int:
+    """Runs `mjx-balance train`; returns the exit code."""
+    args = _parse(argv)
+    if args.resume and args.run_dir:
+        return complain("--resume continues a folder in place; leave --run-dir out")
+    try:
+        with quiet_imports("torch", *(["warp"] if args.config.engine != "warp" else [])):
+            import mjx_balance.training.run  # noqa: F401
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        return complain(
+            f"training needs {package}, which is not installed; {how_to_install('train')}"
+        )
+    return _train(args)
+
+
+def _parse(argv: list[str]) -> TrainArgs:
+    """The flags; what they leave out is the preset's, the robot's or the resumed run's."""
+    start, _ = tyro.cli(StartingPoint, args=argv, return_unknown_args=True, add_help=False)
+    if start.resume is None:
+        default = TrainArgs(config=fitted(preset(start.preset), start.robot))
+    else:
+        default = TrainArgs(config=read_run_config(start.resume))
+    return tyro.cli(TrainArgs, args=argv, prog="mjx-balance train", default=default)
+
+
+def _train(args: TrainArgs) -> int:
+    from jax.errors import JaxRuntimeError
+
+    from mjx_balance.report.progress import Display
+    from mjx_balance.training import processes, run, sizing
+
+    display = Display()
+    try:
+        place = None
+        where = (args.coordinator, args.process_id, args.num_processes)
+        if args.distributed or where != (None, None, None):
+            place = processes.find_place(*where)
+            if place.index:
+                display = Display(Console(quiet=True))
+        run.train(args.config, args.run_dir, args.resume, display, place, args.profile)
+    except (processes.ProcessLostError, PolicyError) as error:
+        return complain(str(error), FAILED)
+    except JaxRuntimeError as error:
+        explanation = sizing.explained(error)
+        if explanation is None:
+            raise
+        return complain(explanation, FAILED)
+    except OSError as error:  # a full disk: what is saved stays, and can be resumed
+        return complain(f"cannot write {error.filename or 'the run'}: {error.strerror}", FAILED)
+    except run.Interrupted as stopped:
+        display.say(str(stopped))
+        return INTERRUPTED
+    return 0
