@@ -121,16 +121,6 @@ class TaskConfig:
         return max(1, round(self.action_ramp * self.sim_steps))
 
     @property
-    def history(self) -> int:
-        """IMU samples that the observation looks back on, the newest included."""
-        return max(*self.gyro_lags, *self.accel_lags) + self.imu_mean
-
-    @property
-    def command_history(self) -> int:
-        """Commands that the observation looks back on, at least the newest."""
-        return max(self.command_lags, default=0) + 1
-
-    @property
     def num_actions(self) -> int:
         """Size of the joint action set (paper: 21 x 21)."""
         return self.action_levels**ACTION_AXES

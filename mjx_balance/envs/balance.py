@@ -12,10 +12,10 @@ from mjx_balance.sim.engines.engine import Engine, settled
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt
 from mjx_balance.task.actions import action_table, check_action
-from mjx_balance.task.observation import observation_names
+from mjx_balance.task.observation import input_rows
 from mjx_balance.task.pushes import Pushes, draw_kicks, kick, kicked_decisions
 from mjx_balance.task.randomization import DRAWS, draw_conditions
-from mjx_balance.task.reward import REWARDS
+from mjx_balance.task.reward import reward_rows
 from mjx_balance.task.symmetry import Symmetries, symmetries
 
 
@@ -53,7 +53,7 @@ class BalanceEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        return len(observation_names(self.config.task, self.scene.robot))
+        return len(input_rows(self.config.task, self.scene.robot))
 
     @property
     def action_size(self) -> int:
@@ -107,9 +107,8 @@ class BalanceEnv(Env):
             info["kicks"] = draw_kicks(self.config.randomization, uniform)
         obs = decision.observation(task, robot, memory, physics.qpos[self.scene.leg_qpos])
         zero = jnp.float32(0.0)
-        metrics = dict.fromkeys(
-            ("tilt_deg", "fall", "diverged", *(f"reward_{name}" for name in REWARDS)), zero
-        )
+        rewards = [f"reward_{row.name}" for row in reward_rows(task)]
+        metrics = dict.fromkeys(("tilt_deg", "fall", "diverged", *rewards), zero)
         return State(physics, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
 
     def reset_staggered(self, rng: jax.Array) -> State:

@@ -18,7 +18,7 @@ from mjx_balance.render.drawing import Painter, RenderError, Window
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.decision import ABSURD
-from mjx_balance.task.observation import observation_scale
+from mjx_balance.task.observation import input_rows
 
 
 class _Actions:
@@ -107,7 +107,8 @@ def _seeds(seed: Any, count: int) -> list[int | None]:
 
 def _observations(task: TaskConfig, robot: Robot) -> spaces.Box:
     """All that `decision.outcome` lets through; what is larger is a diverged simulation's."""
-    most = (ABSURD / observation_scale(task, robot)).astype(np.float32)
+    scale = np.asarray([row.scale for row in input_rows(task, robot)], np.float32)
+    most = ABSURD / scale
     return spaces.Box(-most, most, dtype=np.float32)
 
 

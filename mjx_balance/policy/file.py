@@ -32,7 +32,7 @@ from mjx_balance.files.run_folder import RunFolder, write_atomically
 from mjx_balance.policy import heads
 from mjx_balance.robots.catalogue import Robot, find_robot, robot_from_dict
 from mjx_balance.task.actions import action_table
-from mjx_balance.task.observation import observation_names, observation_scale
+from mjx_balance.task.observation import input_rows
 
 FORMAT = "mjx_balance.policy"
 FORMAT_VERSION = 4
@@ -220,7 +220,7 @@ def installed_version(package: str) -> str | None:
 
 def _described(config: Config, robot: Robot) -> dict[str, Any]:
     """What follows from a config, written out for whoever runs the policy elsewhere."""
-    task = config.task
+    task, rows = config.task, input_rows(config.task, robot)
     return {
         "robot": to_dict(robot),
         "network": {
@@ -229,8 +229,8 @@ def _described(config: Config, robot: Robot) -> dict[str, Any]:
             "radial": config.dqn.head == "radial",
         },
         "observation": {
-            "names": list(observation_names(task, robot)),
-            "scale": observation_scale(task, robot).tolist(),
+            "names": [row.name for row in rows],
+            "scale": [row.scale for row in rows],
             "height_offset_m": task.body_height,
             "imu_lag_s": task.sim_dt,
             "imu_mean_samples": task.imu_mean,

@@ -15,7 +15,7 @@ from mjx_balance.evaluation.suites import HEADLINE
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.attitude import roll_pitch
-from mjx_balance.task.reward import reward_terms
+from mjx_balance.task.reward import RewardInputs, reward_terms
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -175,11 +175,11 @@ def reward_figure(task: TaskConfig) -> plt.Figure:
     change = np.linspace(-2, 2, 301)
     none = np.zeros_like(tilt)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    left.plot(tilt, reward_terms(task, tilt, tilt, none)["level"], color=BLUE, lw=2)
+    left.plot(tilt, reward_terms(task, RewardInputs(tilt, tilt, none))["level"], color=BLUE, lw=2)
     left.set_title("instant incline (paper Eq. 4, Fig. 4)")
     left.set_xlabel("body tilt [deg]")
     left.set_ylabel("reward")
-    toward = reward_terms(task, change, none, none)["toward"]
+    toward = reward_terms(task, RewardInputs(change, none, none))["toward"]
     right.plot(change, np.where(toward >= 0, toward, np.nan), color="#4d9221", lw=2)
     right.plot(change, np.where(toward <= 0, toward, np.nan), color=ORANGE, lw=2)
     right.set_title("toward horizontal (our reading of Fig. 5)")

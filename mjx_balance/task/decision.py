@@ -13,8 +13,14 @@ from mjx_balance.config import TaskConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array, kinematics, tilt
 from mjx_balance.task.actions import apply_action
-from mjx_balance.task.observation import extend_history, observe
-from mjx_balance.task.reward import failed, reward_terms
+from mjx_balance.task.observation import (
+    Signals,
+    extend_history,
+    input_rows,
+    lookback,
+    observe,
+)
+from mjx_balance.task.reward import RewardInputs, failed, reward_terms
 
 ABSURD = 1e4
 """Size, in rad, rad/s or m/s^2, from which a value of the simulation is no motion any more."""
@@ -26,10 +32,10 @@ class Memory(NamedTuple):
     heights: Array
     """(..., legs) foot heights that the legs were last told to take, m."""
     commanded: Array
-    """(..., task.command_history, legs) foot heights that the latest actions asked for, the
+    """(..., n, legs) foot heights that the latest actions asked for, the
     newest last, m; late actions are asked for before the legs are told."""
     imu: Array
-    """(..., task.history, 6) latest IMU samples, the newest last, rad/s and m/s^2."""
+    """(..., n, 6) latest IMU samples, the newest last, rad/s and m/s^2."""
     tilt: Array
     """(...) body tilt that was last rewarded, deg."""
 
@@ -67,11 +73,12 @@ def start(task: TaskConfig, robot: Robot, still: Array) -> Memory:
       still: (..., 6) IMU sample at rest.
     """
     xp = still.__array_namespace__()
+    rows = input_rows(task, robot)
     heights = xp.zeros((*still.shape[:-1], len(robot.legs)), still.dtype) + task.body_height
     return Memory(
         heights=heights,
-        commanded=_repeated(heights, task.command_history),
-        imu=_repeated(still, task.history),
+        commanded=_repeated(heights, lookback(rows, "commands")),
+        imu=_repeated(still, lookback(rows, "imu")),
         tilt=xp.zeros_like(still[..., 0]),
     )
 
@@ -147,7 +154,8 @@ def outcome(
     angles = xp.where(diverged[..., None, None], told, angles)
     fell = diverged | failed(task, tilts).any(axis=-1)
     after = tilts.mean(axis=-1) if task.reward_tilt == "mean" else tilts[..., -1]
-    rewards = reward_terms(task, memory.tilt, after, fell.astype(after.dtype))
+    inputs = RewardInputs(memory.tilt, after, fell.astype(after.dtype))
+    rewards = reward_terms(task, inputs)
     memory = memory._replace(imu=extend_history(memory.imu, samples), tilt=after)
     obs = observation(task, robot, memory, angles)
     return memory, Outcome(obs, rewards, tilts, fell, diverged)
@@ -162,7 +170,8 @@ def _absurd(values: Array, axes: int) -> Array:
 def observation(task: TaskConfig, robot: Robot, memory: Memory, angles: Array) -> Array:
     """The network's input (..., obs_size), for measured joint angles (..., legs, 3), rad."""
     heights = kinematics.foot_heights(robot, angles)
-    return observe(task, robot, heights, memory.commanded, memory.imu)
+    signals = Signals(heights[..., None, :], memory.commanded, memory.imu)
+    return observe(input_rows(task, robot), signals)
 
 
 def _repeated(row: Array, times: int) -> Array:

@@ -1,7 +1,13 @@
-"""The observation of paper Eq. 2: four foot heights and lagged raw IMU samples.
+"""The observation as a table of rows: paper Eq. 2, and what else a network may be given.
 
-On request the commanded foot heights follow the measured ones.
+`input_rows` alone knows the layout. Names, scales, the mirror, the policy's manifest and the
+runtime on a robot follow from its rows.
 """
+
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,61 +15,165 @@ from mjx_balance.config import TaskConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
-IMU_CHANNELS = 6
-"""Gyro x, y, z in rad/s, then accelerometer x, y, z in m/s^2."""
+
+class Mirror(NamedTuple):
+    """What an input is in the left-right mirror: `sign` times another input."""
+
+    row: str
+    """Name of that input."""
+    sign: int
+    """1 or -1."""
+
+
+class Row(NamedTuple):
+    """One input of the network: the mean of `window` samples, each less `offset`, over `scale`."""
+
+    name: str
+    """Unique, e.g. `H_LF`, `C_LF,d-1`, `V_x,t-2`, `Acc_y,t-15`."""
+    sensor: str
+    """One of `SENSORS`."""
+    index: int
+    """Leg in the robot's order, or axis: 0, 1, 2 for x, y, z."""
+    lag: int
+    """Age of the newest sample averaged, in samples of the sensor; 0 is the latest."""
+    window: int
+    """Samples averaged, from there back."""
+    offset: float
+    """In the sensor's unit."""
+    scale: float
+    """Size that enters the network as 1, in the sensor's unit; a float32."""
+    mirror: Mirror
+
+
+class Signals(NamedTuple):
+    """Samples of all sensors up to a decision, the newest last."""
+
+    heights: Array
+    """(..., 1, legs) measured foot heights, m."""
+    commands: Array
+    """(..., n, legs) commanded foot heights, a sample per decision, m."""
+    imu: Array
+    """(..., n, 6) gyro x, y, z and accelerometer x, y, z, a sample per physics step, rad/s and
+    m/s^2."""
+
+
+class Sensor(NamedTuple):
+    """Where samples of a sensor are."""
+
+    signal: str
+    """A field of `Signals`."""
+    channel: int
+    """Its entry there that has index 0."""
+
+
+SENSORS = {
+    "height": Sensor("heights", 0),
+    "command": Sensor("commands", 0),
+    "gyro": Sensor("imu", 0),
+    "accelerometer": Sensor("imu", 3),
+}
+TURN_SIGNS, MOTION_SIGNS = (-1, 1, -1), (1, -1, 1)
+"""Signs of x, y and z in the left-right mirror: of turns about them, of motion along them."""
+
+
+@functools.lru_cache(maxsize=16)
+def input_rows(task: TaskConfig, robot: Robot) -> tuple[Row, ...]:
+    """The network's inputs, in order.
+
+    Measured heights, commanded heights lag by lag, then gyro x and y and accelerometer x and y at
+    every lag (paper Eq. 2). With `task.imu_mean` = 5, `V_x,t-10` is the mean of the samples that
+    are 10 to 14 steps old.
+
+    Args:
+      task: lags, window, scales, standing height.
+      robot: names and sides of the legs.
+    """
+
+    def legs(symbol: str, sensor: str, lag: int = 0, suffix: str = "") -> list[Row]:
+        names = [f"{symbol}_{leg.name}{suffix}" for leg in robot.legs]
+        scale = float(np.float32(task.height_scale))
+        return [
+            Row(name, sensor, k, lag, 1, task.body_height, scale, Mirror(names[partner], 1))
+            for k, (name, partner) in enumerate(zip(names, _partners(robot), strict=True))
+        ]
+
+    def axis(symbol: str, sensor: str, index: int, lag: int, scale: float, sign: int) -> Row:
+        name, scale = f"{symbol}_{'xyz'[index]},t-{lag}", float(np.float32(scale))
+        return Row(name, sensor, index, lag, task.imu_mean, 0.0, scale, Mirror(name, sign))
+
+    rows = legs("H", "height")
+    for lag in task.command_lags:
+        rows += legs("C", "command", lag, f",d-{lag}")
+    for k in (0, 1):
+        for lag in task.gyro_lags:
+            rows.append(axis("V", "gyro", k, lag, task.gyro_scale, TURN_SIGNS[k]))
+    for k in (0, 1):
+        for lag in task.accel_lags:
+            rows.append(axis("Acc", "accelerometer", k, lag, task.accel_scale, MOTION_SIGNS[k]))
+    return tuple(rows)
+
+
+def _partners(robot: Robot) -> list[int]:
+    """The leg on the other side of each."""
+    sides = list(zip(robot.left, robot.front, strict=True))
+    return [sides.index((not left, front)) for left, front in sides]
 
 
 def observation_names(task: TaskConfig, robot: Robot) -> tuple[str, ...]:
-    """Name of every observation entry, in order, e.g. `H_LF`, `V_x,t-2`, `Acc_y,t-15`.
-
-    Commanded heights are `C_LF,d-1`: LF's of the decision before the latest. With
-    `task.imu_mean` = 5, `V_x,t-10` is the mean of the samples 10 to 14 steps back.
-    """
-    names = [f"H_{leg}" for leg in robot.names]
-    names += [f"C_{leg},d-{lag}" for lag in task.command_lags for leg in robot.names]
-    for symbol, lags in (("V", task.gyro_lags), ("Acc", task.accel_lags)):
-        names += [f"{symbol}_{axis},t-{lag}" for axis in "xy" for lag in lags]
-    return tuple(names)
+    """Name of every observation entry, in order."""
+    return tuple(row.name for row in input_rows(task, robot))
 
 
-def observation_scale(task: TaskConfig, robot: Robot) -> np.ndarray:
-    """(obs_size,) physical size of a network input of 1: m, rad/s and m/s^2."""
-    return np.asarray(
-        [task.height_scale] * (1 + len(task.command_lags)) * len(robot.legs)
-        + [task.gyro_scale] * 2 * len(task.gyro_lags)
-        + [task.accel_scale] * 2 * len(task.accel_lags),
-        np.float32,
-    )
+def lookback(rows: Sequence[Row], signal: str) -> int:
+    """Samples of a signal that the rows look back on, the newest included; at least one."""
+    ages = [row.lag + row.window for row in rows if SENSORS[row.sensor].signal == signal]
+    return max(ages, default=1)
 
 
-def observe(task: TaskConfig, robot: Robot, heights: Array, commanded: Array, imu: Array) -> Array:
+def observe(rows: tuple[Row, ...], signals: Signals) -> Array:
     """Builds the scaled observation.
 
     Args:
-      task: lags and scales.
-      robot: leg order.
-      heights: (..., legs) measured foot heights, m.
-      commanded: (..., task.command_history, legs) commanded foot heights, the newest last, m.
-      imu: (..., task.history, 6) latest IMU samples, the newest last.
+      rows: from `input_rows`.
+      signals: at least `lookback` samples of each.
 
     Returns:
-      (..., obs_size) in the order of `observation_names`.
+      (..., len(rows)), of the type of the IMU's samples.
     """
-    xp = imu.__array_namespace__()
-    newest = imu.shape[-2] - 1
-    block = np.arange(task.imu_mean)[:, None]
-    gyro = imu[..., newest - block - np.asarray(task.gyro_lags), :].mean(axis=-3)
-    accel = imu[..., newest - block - np.asarray(task.accel_lags), :].mean(axis=-3)
-    latest = commanded.shape[-2] - 1
-    parts = (
-        heights - task.body_height,
-        *(commanded[..., latest - lag, :] - task.body_height for lag in task.command_lags),
-        gyro[..., 0],
-        gyro[..., 1],
-        accel[..., 3],
-        accel[..., 4],
-    )
-    return xp.concatenate(parts, axis=-1) / observation_scale(task, robot).astype(imu.dtype)
+    xp = signals.imu.__array_namespace__()
+    runs, scale = _compiled(rows)
+    inputs = []
+    for run in runs:
+        # Offsets come first: XLA then adds them to the kinematics' constants.
+        samples = getattr(signals, run.signal) - run.offset
+        newest = samples.shape[-2] - 1
+        inputs.append(samples[..., newest - run.ages, run.channels].mean(axis=-2))
+    return xp.concatenate(inputs, axis=-1) / scale.astype(signals.imu.dtype)
+
+
+class _Run(NamedTuple):
+    """Consecutive rows, n of them, of one signal, offset and window."""
+
+    signal: str
+    offset: float
+    ages: np.ndarray
+    """(window, n) of the samples averaged."""
+    channels: np.ndarray
+    """(n,)"""
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(rows: tuple[Row, ...]) -> tuple[list[_Run], np.ndarray]:
+    """The rows as runs, and their scales (n,)."""
+    runs = []
+    for (signal, offset, window), group in itertools.groupby(
+        rows, key=lambda row: (SENSORS[row.sensor].signal, row.offset, row.window)
+    ):
+        run = list(group)
+        ages = np.arange(window)[:, None] + [row.lag for row in run]
+        channels = np.asarray([SENSORS[row.sensor].channel + row.index for row in run])
+        runs.append(_Run(signal, offset, ages, channels))
+    return runs, np.asarray([row.scale for row in rows], np.float32)
 
 
 def extend_history(history: Array, samples: Array) -> Array:

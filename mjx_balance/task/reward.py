@@ -1,40 +1,69 @@
-"""Failure and the three rewards of paper 3.2."""
+"""Failure, and the reward as a table of terms: the three of paper 3.2."""
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.task import Array
 
-REWARDS = ("level", "toward", "fail")
-"""Names of the rewards."""
+
+class RewardInputs(NamedTuple):
+    """What the reward looks at of one decision."""
+
+    tilt_before: Array
+    """(...) body tilt when the decision was taken, deg."""
+    tilt_after: Array
+    """(...) body tilt at its end, deg."""
+    fell: Array
+    """(...) 1 where the body failed on the way, else 0."""
+
+
+class RewardRow(NamedTuple):
+    """One term of the reward: `weight * function(task, inputs)`."""
+
+    name: str
+    """Its metric is `reward_NAME`."""
+    function: Callable[[TaskConfig, RewardInputs], Array]
+    weight: float
+
+
+def level(task: TaskConfig, inputs: RewardInputs) -> Array:
+    """Eq. 4: exp(-sharpness * tilt); a tilt is never negative."""
+    xp = inputs.tilt_after.__array_namespace__()
+    return xp.exp(-task.reward_sharpness * inputs.tilt_after)
+
+
+def toward(task: TaskConfig, inputs: RewardInputs) -> Array:
+    """Fig. 5: tilt lost, over a scale, from -1 to 1."""
+    xp = inputs.tilt_after.__array_namespace__()
+    gain = inputs.tilt_before - inputs.tilt_after
+    return xp.clip(gain / task.reward_toward_scale, -1.0, 1.0)
+
+
+def fail(task: TaskConfig, inputs: RewardInputs) -> Array:
+    """1 on a fall."""
+    return inputs.fell
+
+
+def reward_rows(task: TaskConfig) -> tuple[RewardRow, ...]:
+    """The terms of the reward, in the order in which they are added."""
+    return (
+        RewardRow("level", level, task.reward_level),
+        RewardRow("toward", toward, task.reward_toward),
+        RewardRow("fail", fail, task.reward_fail),
+    )
+
+
+def reward_terms(task: TaskConfig, inputs: RewardInputs) -> dict[str, Array]:
+    """The weighted terms (...) of one decision by name; the reward is their sum."""
+    return {row.name: row.weight * row.function(task, inputs) for row in reward_rows(task)}
 
 
 def failed(task: TaskConfig, tilt: Array) -> Array:
-    """True where the body tilts past `fail_tilt`, or is no number at all.
+    """True where the body tilts past `fail_tilt`, or is not a number.
 
     Args:
       task: the limit.
       tilt: (...) deg.
     """
     return ~(tilt <= task.fail_tilt)
-
-
-def reward_terms(task: TaskConfig, before: Array, after: Array, fell: Array) -> dict[str, Array]:
-    """The paper's three rewards for one decision.
-
-    Args:
-      task: weights.
-      before: (...) body tilt when the decision was taken, deg.
-      after: (...) body tilt at its end, deg.
-      fell: (...) 1 where the body failed on the way, else 0.
-
-    Returns:
-      level: Eq. 4, w * exp(-1.5 * tilt); a tilt is never negative.
-      toward: Fig. 5, w * clip((before - after) / scale, -1, 1).
-      fail: -0.5 on a fall.
-    """
-    xp = after.__array_namespace__()
-    gain = xp.clip((before - after) / task.reward_toward_scale, -1.0, 1.0)
-    return {
-        "level": task.reward_level * xp.exp(-task.reward_sharpness * after),
-        "toward": task.reward_toward * gain,
-        "fail": task.reward_fail * fell,
-    }

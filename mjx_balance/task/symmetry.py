@@ -6,6 +6,7 @@ import numpy as np
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.robots.catalogue import Robot
+from mjx_balance.task.observation import input_rows
 
 
 class Symmetries(NamedTuple):
@@ -20,26 +21,18 @@ class Symmetries(NamedTuple):
 
 
 def symmetries(task: TaskConfig, robot: Robot) -> Symmetries:
-    """The mirror of the observation of Eq. 2 and the actions of Eq. 3.
+    """The left-right mirror of the observation's rows and the actions of Eq. 3.
 
-    Left and right legs change places; the roll rate, the lateral acceleration and a_x turn
-    their signs. It is exact. Front-hind is no symmetry of the robot: all its knees bend
-    backward.
+    a_x changes its sign. The mirror is exact. Front-hind is no symmetry of the robot: all its
+    knees bend backward.
     """
-    left, front = np.asarray(robot.left), np.asarray(robot.front)
-    partner = [
-        np.flatnonzero((left == ~left[k]) & (front == front[k]))[0] for k in range(len(left))
-    ]
-    gyro, accel = len(task.gyro_lags), len(task.accel_lags)
-    rows = 1 + len(task.command_lags)  # measured heights, commanded ones
-    heights = rows * len(left)
-    size = heights + 2 * (gyro + accel)
-    swapped = np.asarray(partner) + len(left) * np.arange(rows)[:, None]
-    mirrored = [*swapped.ravel(), *range(heights, size)]
-    turned = [1] * heights + [-1] * gyro + [1] * (gyro + accel) + [-1] * accel
+    rows = input_rows(task, robot)
+    place = {row.name: k for k, row in enumerate(rows)}
+    mirrored = [place[row.mirror.row] for row in rows]
+    signs = [row.mirror.sign for row in rows]
     actions = np.arange(task.num_actions).reshape(task.action_levels, task.action_levels)
     return Symmetries(
-        np.asarray((range(size), mirrored), np.int32),
-        np.asarray(([1] * size, turned), np.float32),
+        np.asarray((range(len(rows)), mirrored), np.int32),
+        np.asarray(([1] * len(rows), signs), np.float32),
         np.asarray((actions.ravel(), actions[::-1].ravel()), np.int32),
     )

@@ -46,7 +46,7 @@ def random_memory(task: TaskConfig, seed: int = 0) -> decision.Memory:
     return decision.Memory(
         heights=0.35 + 0.01 * rng.uniform(-1, 1, (N, LEGS)),
         commanded=0.35 + 0.01 * rng.uniform(-1, 1, (N, 3, LEGS)),
-        imu=rng.normal(size=(N, task.history, 6)),
+        imu=rng.normal(size=(N, 63, 6)),
         tilt=np.asarray((0.5, 2.0, 4.0)),
     )
 
