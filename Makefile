@@ -9,7 +9,7 @@ RUNTIME := $(VENV)/.installed-$(EXTRAS)
 DEV := $(VENV)/.installed-dev-$(EXTRAS)
 DOCS := $(VENV)/.installed-docs
 
-.PHONY: train test check docs dist bench bugs format clean
+.PHONY: train test check docs dist bench bugs mutants format clean
 
 train: $(RUNTIME)
 	$(BIN)/python train.py $(ARGS)
@@ -35,7 +35,10 @@ bench: $(RUNTIME)
 	$(BIN)/python benchmarks/throughput.py $(ARGS)
 
 bugs: $(DEV)
-	$(BIN)/python tests/planted/run.py $(ARGS)
+	PYTHONPATH=tests $(BIN)/python -m planted.bugs $(ARGS)
+
+mutants: $(DEV)
+	PYTHONPATH=tests $(BIN)/python -m planted.mutants --write docs/testing.md $(ARGS)
 
 format: $(DEV)
 	$(BIN)/ruff check --fix .

@@ -1,19 +1,24 @@
 """Fixtures shared by the tests, and two CPU devices for those that shard."""
 
 import os
+import re
+import subprocess
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fleet import ENVS, EPISODE, Feedback, Fleet, drive, keys, make_fleet, nominal, under
 
 from mjx_balance.config import Config, preset
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.sim.scene import Scene, load_scene
+
+pytest_plugins = ("fixtures.bodies", "fixtures.fleet")
 
 jax.config.update("jax_num_cpu_devices", 2)
 # The suite compiles longer than it computes. XLA reads this when its first device is asked for.
@@ -86,26 +91,19 @@ def xp(request: pytest.FixtureRequest) -> types.ModuleType:
     return request.param
 
 
-@pytest.fixture(scope="session")
-def fleet() -> Fleet:
-    """Randomised MJX envs whose step is compiled once for all tests."""
-    return make_fleet()
+@pytest.fixture
+def read_video() -> Callable[[Path], tuple[float, np.ndarray]]:
+    """Path of a video -> frames per second, and the frames (n, height, width, 3)."""
 
+    def read(path: Path) -> tuple[float, np.ndarray]:
+        # By ffmpeg itself: imageio's readers leave pipes open, which is a warning.
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path)]
+        done = subprocess.run(
+            [*command, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
+        )
+        said = done.stderr.decode()
+        width, height = map(int, re.findall(r"Video: .*?(\d{2,})x(\d{2,})", said)[0])
+        frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
+        return float(re.findall(r"([\d.]+) fps", said)[0]), frames.astype(float)
 
-@pytest.fixture(scope="session")
-def closed_loop(fleet: Fleet) -> list[Any]:
-    """States of 10 s under feedback: half of the envs nominal, the others random and pushed.
-
-    No sensor noise, so that plain MuJoCo can be asked for the same.
-    """
-    state = fleet.reset(keys(1))
-    drawn = jax.device_get(state.info["conditions"])._replace(imu_noise=nominal().imu_noise)
-    plain = np.arange(ENVS) < ENVS // 2
-    mixed = [
-        np.where(plain.reshape(-1, *[1] * (b.ndim - 1)), a, b)
-        for a, b in zip(nominal(), drawn, strict=True)
-    ]
-    kicks = jnp.where(plain[:, None, None], 0, state.info["kicks"])
-    state = state.replace(info=state.info | {"kicks": kicks})
-    act = Feedback(fleet.env.config, fleet.env.scene.robot, EPISODE)
-    return drive(fleet, under(state, type(drawn)(*mixed)), act, EPISODE)
+    return read

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import safetensors
 import safetensors.numpy
-from bodies import with_legs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -259,7 +258,8 @@ LAYOUTS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def other_robot(robot: Robot) -> Robot:
+@pytest.fixture(scope="session")
+def other_robot(robot: Robot, bodies: Any) -> Robot:
     """Legs of all kinds: other lengths, signs and zeros, knees forward, hips below the trunk."""
     changes: list[dict[str, Any]] = [
         {"signs": (1.0, -1.0, 1.0), "zeros": (0.1, -0.7, 0.3), "drop": 0.04},
@@ -267,14 +267,14 @@ def other_robot(robot: Robot) -> Robot:
         {"signs": (-1.0, 1.0, -1.0), "offset": 0.06, "drop": -0.01},
         {"zeros": (0.0, 0.5, -1.0), "offset": -0.05, "calf": 0.2},
     ]
-    legs = (with_legs(robot, **change).legs[k] for k, change in enumerate(changes))
+    legs = (bodies.with_legs(robot, **change).legs[k] for k, change in enumerate(changes))
     return dataclasses.replace(robot, legs=tuple(legs), foot_radius=0.03)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("legs", ["ours", "others"])
 def test_it_is_the_tasks_decision_for_any_layout_and_legs(
-    layout: str, legs: str, tmp_path: Path, config: Config
+    layout: str, legs: str, tmp_path: Path, config: Config, other_robot: Robot
 ) -> None:
     """Random samples and joint angles, through `task/decision.py` and through the runtime."""
     head, changes = LAYOUTS[layout]
@@ -282,7 +282,7 @@ def test_it_is_the_tasks_decision_for_any_layout_and_legs(
     policy = written(tmp_path / "p", config)
     task, robot = config.task, find_robot(config.robot)
     if legs == "others":
-        robot = other_robot(robot)
+        robot = other_robot
         rewrite(tmp_path / "p", lambda w, m: m.update(robot=to_dict(robot)))
     rig = Rig(tmp_path / "p")
     rng = np.random.default_rng(1)

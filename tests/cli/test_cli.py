@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import videos
 
 from mjx_balance.cli import main
 from mjx_balance.config import ConfigError, preset, to_dict
@@ -236,7 +235,7 @@ def test_impossible_commands_are_refused(
 
 @pytest.mark.parametrize("who", ["controller", "policy"])
 def test_evaluate_writes_figures_and_a_video(
-    who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, read_video: Any
 ) -> None:
     """0.4 s of a baseline and of a policy, to the end of the command."""
     names = ("--controller", "pd-imu") if who == "controller" else (str(SHIPPED),)
@@ -260,7 +259,7 @@ def test_evaluate_writes_figures_and_a_video(
         pytest.skip(said.err)
     assert code == 0
     assert "video of the first scenario: v.mp4" in said.out
-    fps, frames = videos.read(tmp_path / "v.mp4")
+    fps, frames = read_video(tmp_path / "v.mp4")
     assert (fps, len(frames), frames.shape[1:3]) == (25, 10, VIDEO_SIZE[::-1])
     assert np.abs(frames[-1] - frames[0]).mean() > 0.1, "the board moves"
 

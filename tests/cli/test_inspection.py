@@ -3,8 +3,8 @@
 import dataclasses
 import re
 from pathlib import Path
+from typing import Any
 
-import bodies
 import mujoco
 import numpy as np
 import pytest
@@ -73,7 +73,7 @@ def test_signs_and_bends_are_said() -> None:
     assert "knee backward; +FL_hip_joint -FL_thigh_joint -FL_calf_joint" in describe(scene, got)[4]
 
 
-def leaning(folder: Path, y: float) -> tuple[Scene, TiltTest]:
+def leaning(bodies: Any, folder: Path, y: float) -> tuple[Scene, TiltTest]:
     """Our robot with its trunk's weight off to one side."""
     spec = bodies.our_spec()
     spec.body("trunk").ipos = [0.02, y, 0]
@@ -83,9 +83,9 @@ def leaning(folder: Path, y: float) -> tuple[Scene, TiltTest]:
     return inspect(str(folder / "maker.toml"))
 
 
-def test_the_board_is_turned_every_way(tmp_path: Path) -> None:
+def test_the_board_is_turned_every_way(bodies: Any, tmp_path: Path) -> None:
     """A robot and its mirror image have as much torque left, in the mirrored legs."""
-    one, other = (leaning(tmp_path, y)[1] for y in (0.04, -0.04))
+    one, other = (leaning(bodies, tmp_path, y)[1] for y in (0.04, -0.04))
     mirrored = other.torque_share[[1, 0, 3, 2]]
     np.testing.assert_allclose(one.torque_share, mirrored, atol=0.01)
     assert one.tilt == pytest.approx(other.tilt, abs=0.01)

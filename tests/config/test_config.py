@@ -7,7 +7,6 @@ import typing
 from typing import Any
 
 import pytest
-from bodies import with_legs
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -164,9 +163,9 @@ def test_reach_of_the_legs_at_the_knee_limits(robot: Robot) -> None:
     assert robot.half_track == pytest.approx(0.142)
 
 
-def test_reach_of_unequal_links_by_coordinates(robot: Robot) -> None:
+def test_reach_of_unequal_links_by_coordinates(robot: Robot, bodies: Any) -> None:
     """The foot's place as a complex number: the thigh, then the calf turned by the knee."""
-    other = with_legs(robot, thigh=0.2, calf=0.25, knee=(-2.5, -0.5))
+    other = bodies.with_legs(robot, thigh=0.2, calf=0.25, knee=(-2.5, -0.5))
     least, most = (abs(0.2 + 0.25 * complex(math.cos(k), math.sin(k))) for k in (-2.5, -0.5))
     assert other.height_range == pytest.approx((least + 0.022, most + 0.022))
 

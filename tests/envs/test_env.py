@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from fleet import ENVS, EPISODE, STAND, Fleet, drive, keys, level, nominal, under, walked
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config
@@ -17,6 +16,7 @@ from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.task.observation import observation_names
 
 RESETS = 4_000
+ENVS, EPISODE, STAND = 32, 50, 220
 LEFT_UP, RIGHT_UP, FRONT_UP, HIND_UP = 20 * 21 + 10, 10, 10 * 21 + 20, 10 * 21
 LASTING = np.resize((STAND, LEFT_UP, RIGHT_UP, FRONT_UP, HIND_UP), ENVS)
 """Action of every env of `pushed`."""
@@ -25,21 +25,21 @@ PUSHES = 8
 
 
 @pytest.fixture(scope="module")
-def pushed(fleet: Fleet) -> list[Any]:
+def pushed(fleet: Any) -> list[Any]:
     """States of 8 decisions on level boards, each env taking one action again and again."""
-    conditions = nominal()._replace(latency=LATE.astype(np.float32))
-    state = level(under(fleet.reset(keys(2)), conditions))
-    return drive(fleet, state, lambda obs, number: LASTING, PUSHES)
+    conditions = fleet.nominal()._replace(latency=LATE.astype(np.float32))
+    state = fleet.level(fleet.under(fleet.reset(fleet.keys(2)), conditions))
+    return fleet.drive(state, lambda obs, number: LASTING, PUSHES)
 
 
-def roll_pitch(fleet: Fleet, states: list[Any]) -> np.ndarray:
+def roll_pitch(fleet: Any, states: list[Any]) -> np.ndarray:
     """(len(states), ENVS, 2) deg."""
     quat = np.asarray([s.pipeline_state.qpos[:, fleet.env.scene.trunk_quat] for s in states])
     turn = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True).as_euler("xyz", degrees=True)
     return turn.reshape(len(states), ENVS, 3)[..., :2]
 
 
-def test_starts_settled_and_level(fleet: Fleet, config: Config) -> None:
+def test_starts_settled_and_level(fleet: Any, config: Config) -> None:
     for env, size in ((fleet.env, 4 + 8 + 6 + 6), (BalanceEnv(config), 34)):
         state: Any = jax.jit(env.reset)(jax.random.PRNGKey(0))
         assert jnp.shape(state.obs) == (env.observation_size,) == (size,)
@@ -52,7 +52,7 @@ def test_starts_settled_and_level(fleet: Fleet, config: Config) -> None:
         np.testing.assert_allclose(state.pipeline_state.qpos, stance.qpos, rtol=1e-6, atol=1e-7)
 
 
-def test_actions_go_the_way_that_the_paper_says(fleet: Fleet, pushed: list[Any]) -> None:
+def test_actions_go_the_way_that_the_paper_says(fleet: Any, pushed: list[Any]) -> None:
     """3 mm over 142 mm roll the body by 1.21 deg, 3 mm over 193 mm pitch it by 0.89 deg."""
     angles = roll_pitch(fleet, pushed)
     for env in np.flatnonzero(~LATE):
@@ -77,7 +77,7 @@ def test_late_robots_do_the_same_one_decision_later(pushed: list[Any]) -> None:
         np.testing.assert_allclose(qpos[2:5, env], qpos[1:4, prompt[env]], atol=2e-3)
 
 
-def test_a_fall_ends_the_episode_and_is_what_is_seen(fleet: Fleet, pushed: list[Any]) -> None:
+def test_a_fall_ends_the_episode_and_is_what_is_seen(fleet: Any, pushed: list[Any]) -> None:
     """6 deg are passed by the fifth or sixth roll, by the seventh pitch; who stands goes on."""
     fell = np.asarray([s.metrics["fall"] for s in pushed[1:]])
     names = observation_names(fleet.env.config.task, fleet.env.scene.robot)
@@ -131,7 +131,7 @@ def test_episodes_end_by_the_time_limit(closed_loop: list[Any]) -> None:
             assert np.isfinite(value).all()
 
 
-def test_a_fall_at_the_time_limit_is_a_fall(fleet: Fleet, pushed: list[Any]) -> None:
+def test_a_fall_at_the_time_limit_is_a_fall(fleet: Any, pushed: list[Any]) -> None:
     state = pushed[4]
     for _ in range(2):
         left = jnp.ones(ENVS, state.info["decisions_left"].dtype)
@@ -143,7 +143,9 @@ def test_a_fall_at_the_time_limit_is_a_fall(fleet: Fleet, pushed: list[Any]) -> 
     np.testing.assert_array_equal(np.asarray(state.done), np.ones(ENVS))
 
 
-def test_boards_go_where_their_scenario_says(fleet: Fleet, closed_loop: list[Any]) -> None:
+def test_boards_go_where_their_scenario_says(
+    fleet: Any, closed_loop: list[Any], walked: Any
+) -> None:
     """Every env its own way, to the servos' lag of 10 ms, which is 0.035 deg at 3.5 deg/s."""
     scenario = closed_loop[0].info["scenario"]
     qpos = np.asarray([state.pipeline_state.qpos for state in closed_loop])
@@ -157,17 +159,17 @@ def test_boards_go_where_their_scenario_says(fleet: Fleet, closed_loop: list[Any
     assert np.ptp(board[-1], axis=0).min() > 5
 
 
-def test_equal_keys_equal_episodes(fleet: Fleet) -> None:
+def test_equal_keys_equal_episodes(fleet: Any) -> None:
     actions = jax.random.randint(jax.random.PRNGKey(7), (ENVS,), 0, 441)
     first, again, other = (
-        jax.device_get(fleet.step(fleet.reset(keys(seed)), actions)) for seed in (5, 5, 6)
+        jax.device_get(fleet.step(fleet.reset(fleet.keys(seed)), actions)) for seed in (5, 5, 6)
     )
     jax.tree.map(np.testing.assert_array_equal, first, again)
     assert np.abs(first.obs - other.obs).max() > 0.01
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
-def test_who_diverges_falls_alone(fleet: Fleet, closed_loop: list[Any], value: float) -> None:
+def test_who_diverges_falls_alone(fleet: Any, closed_loop: list[Any], value: float) -> None:
     """NaN, infinity or a huge speed in one env of a batch: its row is a fall's, and finite."""
     before = closed_loop[20]
     info = {name: part for name, part in before.info.items() if name != "action"}

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from fleet import ENVS, KICKED, STAND, Fleet, keys, level, nominal, under
 
 from mjx_balance.config import RandomizationConfig, preset
 from mjx_balance.envs.balance import BalanceEnv
@@ -17,10 +16,13 @@ from mjx_balance.task.observation import observation_names
 from mjx_balance.task.randomization import Conditions
 
 MANY = 4_000
+ENVS, STAND = 32, 220
+KICKED = (13, 25, 38)
+"""Decisions of an episode that begin with a kick: 2.5, 5 and 7.5 s, in decisions of 0.2 s."""
 
 
 @pytest.fixture(scope="module")
-def drawn(fleet: Fleet) -> tuple[Conditions, Any, np.ndarray]:
+def drawn(fleet: Any) -> tuple[Conditions, Any, np.ndarray]:
     """Circumstances, scenarios and kicks of many resets."""
 
     def draw(key: jax.Array) -> Any:
@@ -72,9 +74,9 @@ def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any, np.nda
     assert np.abs(together).max() < 0.07
 
 
-def test_a_kick_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: Fleet) -> None:
+def test_a_kick_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: Any) -> None:
     """On level boards, robots given that velocity by hand move alike, whatever the decision."""
-    start = level(under(fleet.reset(keys(5)), nominal()))
+    start = fleet.level(fleet.under(fleet.reset(fleet.keys(5)), fleet.nominal()))
     kicks, physics = np.asarray(start.info["kicks"]), start.pipeline_state
     free = fleet.env.scene.model.jnt_dofadr[fleet.env.scene.model.joint("robot/root").id]
 
@@ -97,7 +99,7 @@ def test_a_kick_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: 
         assert shaken.min() > 0.5, "m/s^2"
 
 
-def test_pushes_change_no_other_draw(fleet: Fleet) -> None:
+def test_pushes_change_no_other_draw(fleet: Any) -> None:
     """Training without pushes takes the random numbers that it took before there were any."""
     config = fleet.env.config
     calm = dataclasses.replace(config.randomization, push_min=0.0, push_max=0.0)
@@ -120,12 +122,12 @@ SIGMA = np.linspace(0.5, 2, ENVS)[:, None] * np.asarray((0.001, 0.002, 0.003, 0.
 
 
 @pytest.fixture(scope="module")
-def noise(fleet: Fleet) -> tuple[np.ndarray, list[Any], list[Any]]:
+def noise(fleet: Any) -> tuple[np.ndarray, list[Any], list[Any]]:
     """Noise (2, ENVS, 50, 6) of two decisions in units of its size, with and without it."""
-    loud = nominal()._replace(imu_noise=SIGMA.astype(np.float32))
+    loud = fleet.nominal()._replace(imu_noise=SIGMA.astype(np.float32))
     runs = []
-    for conditions in (nominal(), loud):
-        state, states = under(fleet.reset(keys(4)), conditions), []
+    for conditions in (fleet.nominal(), loud):
+        state, states = fleet.under(fleet.reset(fleet.keys(4)), conditions), []
         for _ in range(2):
             state = fleet.step(state, np.full(ENVS, STAND))
             states.append(jax.device_get(state))
@@ -163,7 +165,7 @@ def test_noise_is_white_and_new_for_every_env_decision_and_channel(noise: Any) -
         assert together(z[:, env], z[:, env + 1]) < 0.2
 
 
-def test_noise_is_seen_and_moves_nobody(fleet: Fleet, noise: Any) -> None:
+def test_noise_is_seen_and_moves_nobody(fleet: Any, noise: Any) -> None:
     _, clean, noisy = noise
     names = np.asarray(observation_names(fleet.env.config.task, fleet.env.scene.robot))
     for a, b in zip(clean, noisy, strict=True):
@@ -178,16 +180,16 @@ def test_noise_is_seen_and_moves_nobody(fleet: Fleet, noise: Any) -> None:
         np.testing.assert_allclose(difference[:, entry], np.degrees(rate), atol=1e-4)
 
 
-def test_envs_of_a_batch_move_in_their_own_circumstances(fleet: Fleet) -> None:
+def test_envs_of_a_batch_move_in_their_own_circumstances(fleet: Any) -> None:
     """Two payloads, gains and soles under one scenario: each is where it is alone."""
-    state = fleet.reset(keys(9))
+    state = fleet.reset(fleet.keys(9))
     drawn = jax.device_get(state.info["conditions"])
     turned = [np.roll(x, 1, axis=0) for x in drawn]
     scenario = jax.tree.map(lambda x: np.repeat(np.asarray(x)[:1], ENVS, 0), state.info["scenario"])
     state = state.replace(info=state.info | {"scenario": scenario})
     actions = np.full(ENVS, STAND + 42)
     first, second = (
-        jax.device_get(fleet.step(under(state, conditions), actions)).pipeline_state.qpos
+        jax.device_get(fleet.step(fleet.under(state, conditions), actions)).pipeline_state.qpos
         for conditions in (drawn, Conditions(*turned))
     )
     np.testing.assert_allclose(np.roll(first, 1, axis=0), second, atol=1e-6)

@@ -3,12 +3,12 @@
 import dataclasses
 import itertools
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import mujoco.viewer
 import numpy as np
 import pytest
-import videos
 
 from mjx_balance.config import Config
 from mjx_balance.render.drawing import PICTURE_SIZE, VIDEO_SIZE, RenderError, Window, write
@@ -34,13 +34,13 @@ def test_a_picture_shows_a_tilted_board(config: Config, scene: Scene, tmp_path: 
 
 
 def test_a_video_shows_the_states_in_order_at_real_speed(
-    config: Config, scene: Scene, tmp_path: Path
+    config: Config, scene: Scene, tmp_path: Path, read_video: Any
 ) -> None:
     tilted = scene.stance.qpos.copy()
     tilted[scene.board_qpos] = np.radians((5, -5))
     level = np.tile(scene.stance.qpos, (60, 1))
     draw(tmp_path / "video.mp4", config, np.concatenate((level, np.tile(tilted, (40, 1)))))
-    fps, frames = videos.read(tmp_path / "video.mp4")
+    fps, frames = read_video(tmp_path / "video.mp4")
     assert (fps, len(frames)) == (25, 10), "0.4 s"
     assert frames.shape[1:3] == VIDEO_SIZE[::-1]
     steps = [np.abs(a - b).mean() for a, b in itertools.pairwise(frames)]
@@ -49,11 +49,11 @@ def test_a_video_shows_the_states_in_order_at_real_speed(
 
 
 def test_a_video_of_a_slower_simulation_plays_at_real_speed(
-    config: Config, scene: Scene, tmp_path: Path
+    config: Config, scene: Scene, tmp_path: Path, read_video: Any
 ) -> None:
     task = dataclasses.replace(config.task, sim_dt=0.1)
     draw(tmp_path / "video.mp4", dataclasses.replace(config, task=task), scene.stance.qpos[None])
-    fps, frames = videos.read(tmp_path / "video.mp4")
+    fps, frames = read_video(tmp_path / "video.mp4")
     assert (fps, len(frames)) == (10, 1)
 
 

@@ -17,7 +17,6 @@ from typing import Any
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from made_up import evaluation_result, metrics_line
 
 from mjx_balance.cli import main
 from mjx_balance.config import Config, preset, to_dict
@@ -42,7 +41,13 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @pytest.fixture(scope="module")
-def run(config: Config, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(
+    config: Config,
+    scene: Scene,
+    tmp_path_factory: pytest.TempPathFactory,
+    metrics_line: Any,
+    evaluations: Any,
+) -> Path:
     """A run folder of two seeds with everything in it; the policy is untrained."""
     folder = tmp_path_factory.mktemp("report") / "run"
     folder.mkdir()
@@ -50,12 +55,9 @@ def run(config: Config, scene: Scene, tmp_path_factory: pytest.TempPathFactory) 
     (folder / "config.json").write_text(json.dumps(to_dict(config)))
     lines = [json.dumps(metrics_line(k, 2)) for k in range(8)]
     (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
-    results = {suite: evaluation_result(suite, 0.1) for suite in ("paper", "corner")}
+    results = evaluations()
     (folder / "evaluation.json").write_text(json.dumps(results))
-    rows = [
-        {"evaluation": {suite: evaluation_result(suite, t) for suite in ("paper", "corner")}}
-        for t in (0.1, 0.2)
-    ]
+    rows = [{"evaluation": evaluations(t)} for t in (0.1, 0.2)]
     (folder / "seeds.json").write_text(json.dumps({"seeds": rows}))
     layers: dict[str, Any] = {
         name: {"kernel": np.zeros((a, b)), "bias": np.zeros(b)}
@@ -271,7 +273,7 @@ def test_the_video_is_of_a_scenario_that_was_measured(
 
 
 def test_the_first_run_that_has_a_policy_is_shown(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, metrics_line: Any
 ) -> None:
     asked: list[tuple] = []
 
@@ -305,13 +307,9 @@ def test_the_first_run_that_has_a_policy_is_shown(
     assert ["seed", "0", "11"] in Tables(text).found[2], "the first run's config"
 
 
-def test_the_seeds_of_alike_runs_are_put_together(config: Config) -> None:
+def test_the_seeds_of_alike_runs_are_put_together(config: Config, evaluations: Any) -> None:
     def run_of(name: str, config: Config | None, *tilts: float) -> Run:
-        results = [
-            {suite: evaluation_result(suite, t + n) for n, suite in enumerate(("paper", "corner"))}
-            for t in tilts
-        ]
-        return Run(Path(name), config=config, results=results)
+        return Run(Path(name), config=config, results=[evaluations(t, t + 1) for t in tilts])
 
     first = run_of("a", config, 0.1)
     more = run_of("b", dataclasses.replace(config, seed=7, num_seeds=2), 0.4, 0.2)
@@ -459,7 +457,12 @@ def test_nothing_that_the_template_is_given_becomes_html() -> None:
 
 
 def test_a_hostile_run_folder_injects_nothing(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    metrics_line: Any,
+    evaluation_result: Any,
 ) -> None:
     """Text in every field that is read, of every file, and in the folder's own name."""
     folder = tmp_path / "<img src=x onerror=alert(1)>"

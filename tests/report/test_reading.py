@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_up import evaluation_result, metrics_line
 
 from mjx_balance.config import preset, to_dict
 from mjx_balance.files import run_folder
@@ -24,7 +23,21 @@ from mjx_balance.report.reading import ReportError
 HOSTILE = "<img src=x onerror=alert(1)>"
 
 
-GOOD_LINE = json.dumps(metrics_line(0, 1))
+@pytest.fixture(scope="session")
+def good_line(metrics_line: Any) -> str:
+    """The first line of a metrics.jsonl."""
+    return json.dumps(metrics_line(0, 1))
+
+
+@pytest.fixture(scope="session")
+def good(metrics_line: Any, evaluations: Any) -> dict[str, Any]:
+    """The files of a run of two seeds."""
+    return {
+        "config.json": to_dict(preset("default")),
+        "metrics.jsonl": [metrics_line(0, 2), metrics_line(1, 2)],
+        "evaluation.json": evaluations(),
+        "seeds.json": {"seeds": [{"evaluation": evaluations()}] * 2},
+    }
 
 
 @pytest.mark.parametrize(
@@ -33,12 +46,12 @@ GOOD_LINE = json.dumps(metrics_line(0, 1))
         ("config.json", "[]", "config.json cannot be used: it is []; it must be a JSON"),
         ("config.json", '{"task": []}', "config.json cannot be used: TaskConfig is []"),
         ("config.json", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a finite number"),
-        ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_st', "metrics.jsonl is shown up to line 2"),
-        ("metrics.jsonl", f'{GOOD_LINE}\n{{"env_steps": 9999}}', "it has no 'train/tilt_deg'"),
-        ("metrics.jsonl", f"{GOOD_LINE}\n5", "metrics.jsonl is shown up to line 2"),
+        ("metrics.jsonl", 'GOOD\n{"env_st', "metrics.jsonl is shown up to line 2"),
+        ("metrics.jsonl", 'GOOD\n{"env_steps": 9999}', "it has no 'train/tilt_deg'"),
+        ("metrics.jsonl", "GOOD\n5", "metrics.jsonl is shown up to line 2"),
         (
             "metrics.jsonl",
-            f"{GOOD_LINE}\n{GOOD_LINE}",
+            "GOOD\nGOOD",
             "line 2, which cannot be used: env_steps is 1",
         ),
         ("seeds.json", '{"best": 1}', "seeds.json cannot be used: it has no 'seeds'"),
@@ -54,25 +67,27 @@ GOOD_LINE = json.dumps(metrics_line(0, 1))
         ("evaluation.json", '{"\\u001b[2J\\ud800": 1}', "cannot be used: ?[2J? is 1; it must"),
         (
             "metrics.jsonl",
-            f"{GOOD_LINE}\n" + " " * 2**19,
+            "GOOD\n" + " " * 2**19,
             "line 2, which cannot be used: it is longer",
         ),
         ("config.json", b"\x80", "config.json cannot be used: it is no JSON"),
     ],
 )
 def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_read(
-    tmp_path: Path, name: str, content: str | bytes, said: str
+    tmp_path: Path, name: str, content: str | bytes, said: str, good_line: Any
 ) -> None:
-    (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
-    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    (tmp_path / "metrics.jsonl").write_text(f"{good_line}\n")
+    if isinstance(content, str):
+        content = content.replace("GOOD", good_line).encode()
+    (tmp_path / name).write_bytes(content)
     run = reading.read_run(tmp_path)
     assert said in "\n".join(run.missing)
     assert len(run.metrics) == 1
     assert all(len(sentence) < 500 for sentence in run.missing)
 
 
-def test_a_folder_in_a_files_place_is_said(tmp_path: Path) -> None:
-    (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
+def test_a_folder_in_a_files_place_is_said(tmp_path: Path, good_line: Any) -> None:
+    (tmp_path / "metrics.jsonl").write_text(f"{good_line}\n")
     for name in ("config.json", "seeds.json"):
         (tmp_path / name).mkdir()
     said = reading.read_run(tmp_path).missing
@@ -105,16 +120,18 @@ HUGE = 10**400
         ("max", None, "max is None"),
     ],
 )
-def test_results_are_numbers(tmp_path: Path, where: str, value: Any, said: str) -> None:
+def test_results_are_numbers(
+    tmp_path: Path, where: str, value: Any, said: str, evaluations: Any, good_line: Any
+) -> None:
     for name in ("evaluation.json", "seeds.json"):
-        results = {suite: evaluation_result(suite, 0.1) for suite in ("paper", "corner")}
+        results = evaluations()
         results["corner"].update({where: value} if where in results["corner"] else {})
         if where in results["corner"]["tilt_deg"]:
             results["corner"]["tilt_deg"][where] = value
         whole: Any = results if name == "evaluation.json" else {"seeds": [{"evaluation": results}]}
         folder = tmp_path / name.removesuffix(".json")
         folder.mkdir()
-        (folder / "metrics.jsonl").write_text(f"{GOOD_LINE}\n")
+        (folder / "metrics.jsonl").write_text(f"{good_line}\n")
         (folder / name).write_text(json.dumps(whole))
         run = reading.read_run(folder)
         assert run.results == []
@@ -142,15 +159,17 @@ def test_results_are_numbers(tmp_path: Path, where: str, value: Any, said: str) 
         ("seeds", {"eval/paper/tilt_mean": [HOSTILE]}),
     ],
 )
-def test_metrics_are_numbers(tmp_path: Path, where: str, value: Any) -> None:
+def test_metrics_are_numbers(
+    tmp_path: Path, where: str, value: Any, metrics_line: Any, good_line: Any
+) -> None:
     bad = metrics_line(1, 1) | {where: value}
-    (tmp_path / "metrics.jsonl").write_text(f"{GOOD_LINE}\n{json.dumps(bad)}\n")
+    (tmp_path / "metrics.jsonl").write_text(f"{good_line}\n{json.dumps(bad)}\n")
     run = reading.read_run(tmp_path)
     assert len(run.metrics) == 1
     assert "metrics.jsonl is shown up to line 2, which cannot be used: " in "".join(run.missing)
 
 
-def test_seeds_that_change_along_the_way_are_refused(tmp_path: Path) -> None:
+def test_seeds_that_change_along_the_way_are_refused(tmp_path: Path, metrics_line: Any) -> None:
     lines = [metrics_line(0, 3), metrics_line(1, 2)]
     (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
     run = reading.read_run(tmp_path)
@@ -158,7 +177,7 @@ def test_seeds_that_change_along_the_way_are_refused(tmp_path: Path) -> None:
     assert "other seeds than in line 1" in "".join(run.missing)
 
 
-def test_validations_are_read_where_there_are_any(tmp_path: Path) -> None:
+def test_validations_are_read_where_there_are_any(tmp_path: Path, metrics_line: Any) -> None:
     name = "eval/corner/tilt_mean"
     lines = [metrics_line(k, 2) for k in range(3)]
     lines[1] |= {name: 0.5, "eval/corner/falls": 1}
@@ -172,7 +191,7 @@ def test_validations_are_read_where_there_are_any(tmp_path: Path) -> None:
     assert "eval/corner/falls" not in run.metrics[1]
 
 
-def test_a_loss_that_is_no_number_is_a_gap(tmp_path: Path) -> None:
+def test_a_loss_that_is_no_number_is_a_gap(tmp_path: Path, metrics_line: Any) -> None:
     lines = [metrics_line(k, 2) for k in range(3)]
     lines[1]["train/loss"] = float("nan")
     lines[1]["seeds"] = dict(lines[1]["seeds"], loss=[float("-inf"), 1.0])
@@ -184,7 +203,7 @@ def test_a_loss_that_is_no_number_is_a_gap(tmp_path: Path) -> None:
 
 
 def test_of_long_metrics_the_beginning_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, metrics_line: Any
 ) -> None:
     texts = [json.dumps(metrics_line(k, 1)) for k in range(4)]
     monkeypatch.setattr(reading, "METRICS_BYTES", len("\n".join(texts[:3])) - 1)
@@ -194,7 +213,9 @@ def test_of_long_metrics_the_beginning_is_read(
     assert "metrics.jsonl is 0.0 MiB long; its first 0 MiB are shown" in "".join(run.missing)
 
 
-def test_only_what_the_report_shows_is_kept(tmp_path: Path) -> None:
+def test_only_what_the_report_shows_is_kept(
+    tmp_path: Path, metrics_line: Any, evaluation_result: Any
+) -> None:
     line = metrics_line(0, 2) | {"train/note": HOSTILE, "more": [HOSTILE]}
     line["seeds"] = {"loss": [1, 2.5], "note": [HOSTILE]}
     (tmp_path / "metrics.jsonl").write_text(json.dumps(line))
@@ -209,7 +230,7 @@ def test_only_what_the_report_shows_is_kept(tmp_path: Path) -> None:
     assert "<" not in repr((run.metrics, run.results))
 
 
-def test_an_evaluation_in_which_all_fell_is_one() -> None:
+def test_an_evaluation_in_which_all_fell_is_one(evaluation_result: Any) -> None:
     result = evaluation_result("paper", 6.0) | {"falls": 8}
     assert reading.suite_result(result, "paper")["falls"] == 8
 
@@ -234,13 +255,6 @@ JSON = st.recursive(
     ),
     max_leaves=6,
 )
-RESULTS = {suite: evaluation_result(suite, 0.1) for suite in ("paper", "corner")}
-GOOD: dict[str, Any] = {
-    "config.json": to_dict(preset("default")),
-    "metrics.jsonl": [metrics_line(0, 2), metrics_line(1, 2)],
-    "evaluation.json": RESULTS,
-    "seeds.json": {"seeds": [{"evaluation": RESULTS}, {"evaluation": RESULTS}]},
-}
 
 
 def places(value: Any) -> list[tuple]:
@@ -260,15 +274,15 @@ def written(name: str, value: Any) -> bytes:
 
 
 @st.composite
-def damaged(draw: st.DrawFn) -> dict[str, bytes]:
+def damaged(draw: st.DrawFn, good: dict[str, Any]) -> dict[str, bytes]:
     """A run folder in which one file was exchanged, edited, cut off or flipped."""
-    files = {name: written(name, value) for name, value in GOOD.items()}
-    name = draw(st.sampled_from(sorted(GOOD)))
+    files = {name: written(name, value) for name, value in good.items()}
+    name = draw(st.sampled_from(sorted(good)))
     how = draw(st.sampled_from(("any JSON", "edited", "key lost", "cut off", "flipped", "garbage")))
     if how == "any JSON":
         files[name] = written(name, draw(JSON))
     elif how in ("edited", "key lost"):
-        value = copy.deepcopy(GOOD[name])
+        value = copy.deepcopy(good[name])
         *path, last = draw(st.sampled_from(places(value)))
         inside = functools.reduce(lambda part, key: part[key], path, value)
         if how == "key lost":
@@ -288,10 +302,11 @@ def damaged(draw: st.DrawFn) -> dict[str, bytes]:
 
 
 @settings(deadline=1_000, max_examples=300, suppress_health_check=[HealthCheck.too_slow])
-@given(files=damaged())
+@given(data=st.data())
 def test_a_damaged_folder_is_read_as_far_as_it_goes(
-    tmp_path_factory: pytest.TempPathFactory, files: dict[str, bytes]
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, good: dict[str, Any]
 ) -> None:
+    files = data.draw(damaged(good))
     folder = tmp_path_factory.mktemp("run")
     for name, content in files.items():
         (folder / name).write_bytes(content)
@@ -314,7 +329,7 @@ UNITS = (b"[", b"[],", b"9", b"\n", b'{"a":', b"\xff", b'"', b"{}\n", b"1e9,")
 
 
 @pytest.mark.parametrize("unit", UNITS)
-@pytest.mark.parametrize("name", sorted(GOOD))
+@pytest.mark.parametrize("name", ["config.json", "evaluation.json", "metrics.jsonl", "seeds.json"])
 def test_a_flood_is_refused_soon_and_in_little_memory(
     tmp_path: Path, name: str, unit: bytes
 ) -> None:
@@ -339,7 +354,9 @@ def test_a_flood_is_refused_soon_and_in_little_memory(
         assert peak < (12 if name == "metrics.jsonl" else 150) * 2**20
 
 
-def test_a_flood_that_is_a_run_is_read_soon_and_in_little_memory(tmp_path: Path) -> None:
+def test_a_flood_that_is_a_run_is_read_soon_and_in_little_memory(
+    tmp_path: Path, metrics_line: Any
+) -> None:
     lines = (json.dumps(metrics_line(k, 5)) for k in range(12_000))
     (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
     rows = ",".join(["{}"] * 700_000)
@@ -351,7 +368,7 @@ def test_a_flood_that_is_a_run_is_read_soon_and_in_little_memory(tmp_path: Path)
     assert "its first 8 MiB are shown" in "".join(run.missing)
 
 
-def test_a_line_before_the_first_update_has_no_loss(tmp_path: Path) -> None:
+def test_a_line_before_the_first_update_has_no_loss(tmp_path: Path, metrics_line: Any) -> None:
     lines = [metrics_line(k, 2) for k in range(3)]
     del lines[0]["train/loss"]
     lines[0]["seeds"] = {name: [0.5, 0.5] for name in lines[0]["seeds"]} | {"loss": [None, None]}

@@ -5,10 +5,10 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import bodies
 import mujoco
 import numpy as np
 import pytest
+from fixtures import bodies
 
 from mjx_balance.config import Config, ConfigError, check, fitted, preset
 from mjx_balance.evaluation.controllers import make_controller, measure_response

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
-import bodies
 import mujoco
 import numpy as np
 import pytest
+from fixtures import bodies
 
 from mjx_balance.config import check, fitted, preset
 from mjx_balance.robots.build import build, model_path

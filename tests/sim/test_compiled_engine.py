@@ -1,28 +1,15 @@
 """MuJoCo's C engine inside a jitted program: the same env as over MJX, call by call."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fleet import (
-    ENVS,
-    EPISODE,
-    KICKED,
-    STAND,
-    Feedback,
-    Fleet,
-    drive,
-    fleet_config,
-    keys,
-    make_fleet,
-    nominal,
-    under,
-)
 
-from mjx_balance.config import preset
+from mjx_balance.config import Config, preset
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.rollout import roll_out
 from mjx_balance.sim.engines import ffi
@@ -35,9 +22,13 @@ from mjx_balance.task.pushes import Pushes
 from mjx_balance.task.randomization import Conditions, draw_conditions
 from mjx_balance.task.tilt import Scenario
 
+ENVS, EPISODE, STAND = 32, 50, 220
+KICKED = np.asarray((13, 25, 38))
+"""Decisions of an episode that begin with a kick: 2.5, 5 and 7.5 s, in decisions of 0.2 s."""
+
 
 @pytest.fixture(scope="module")
-def compiled() -> Fleet:
+def compiled(make_fleet: Any) -> Any:
     """The envs of the fixture `fleet`, over the C engine."""
     return make_fleet("mujoco")
 
@@ -56,12 +47,12 @@ def in_double(tree: Any) -> dict[str, np.ndarray]:
     return {name: np.asarray(x, float) for name, x in tree._asdict().items()}
 
 
-def test_training_and_evaluation_have_the_same_physics(compiled: Fleet) -> None:
+def test_training_and_evaluation_have_the_same_physics(compiled: Any) -> None:
     """10 s under feedback, payload, friction, gains and latency; what differs is float32."""
-    env, start = compiled.env, compiled.reset(keys(1))
+    env, start = compiled.env, compiled.reset(compiled.keys(1))
     quiet = start.info["conditions"]._replace(imu_noise=jnp.zeros((ENVS, 6)))
-    act = Feedback(env.config, env.scene.robot, EPISODE)
-    states = drive(compiled, under(start, quiet), act, EPISODE)
+    act = compiled.feedback(EPISODE)
+    states = compiled.drive(compiled.under(start, quiet), act, EPISODE)
     tilt = np.asarray([state.metrics["tilt_deg"] for state in states[1:]])
     rollout = roll_out(
         env.scene,
@@ -84,9 +75,7 @@ def test_training_and_evaluation_have_the_same_physics(compiled: Fleet) -> None:
     assert tilt.max() == pytest.approx(theirs.max(), rel=0.05)
 
 
-def test_the_envs_of_both_engines_agree(
-    fleet: Fleet, compiled: Fleet, closed_loop: list[Any]
-) -> None:
+def test_the_envs_of_both_engines_agree(fleet: Any, compiled: Any, closed_loop: list[Any]) -> None:
     """MJX's 10 s, actions and all, repeated: tilt, IMU samples and observations open loop."""
     state = closed_loop[0]
     worst = {"tilt": [], "imu": [], "obs": []}
@@ -106,12 +95,17 @@ def test_the_envs_of_both_engines_agree(
     assert fleet.env.observation_size == compiled.env.observation_size
 
 
-def circumstances(seed: int, count: int) -> Conditions:
-    config = fleet_config()
-    uniform = np.random.default_rng(seed).uniform(size=(count, 8))
-    robot = load_scene(config).robot
-    drawn = draw_conditions(config.randomization, robot, uniform.astype(np.float32))
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), drawn)
+@pytest.fixture(scope="module")
+def circumstances(fleet_config: Config) -> Callable[[int, int], Conditions]:
+    """Seed and number of envs -> their circumstances."""
+
+    def draw(seed: int, count: int) -> Conditions:
+        uniform = np.random.default_rng(seed).uniform(size=(count, 8))
+        robot = load_scene(fleet_config).robot
+        drawn = draw_conditions(fleet_config.randomization, robot, uniform.astype(np.float32))
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), drawn)
+
+    return draw
 
 
 def moved(engine: Engine, state: PhysicsState, ctrl: Any, conditions: Conditions | None) -> Any:
@@ -128,12 +122,14 @@ def held(scene: Scene, count: int) -> tuple[PhysicsState, jax.Array]:
     return state, jnp.asarray(hold + 0.01 * noise, jnp.float32)
 
 
-def test_a_call_depends_on_its_arguments_alone(scene: Scene, engine: Engine) -> None:
+def test_a_call_depends_on_its_arguments_alone(
+    fleet: Any, scene: Scene, engine: Engine, circumstances: Any
+) -> None:
     """Whatever circumstances, numbers of envs and devices were called for before."""
     state, ctrl = held(scene, 6)
     first, second = circumstances(0, 6), circumstances(1, 6)
     mixed = jax.tree.map(lambda a, b: a.at[2:4].set(b[2:4]), first, second)
-    plain = jax.tree.map(jnp.asarray, nominal(6))
+    plain = jax.tree.map(jnp.asarray, fleet.nominal(6))
     cases = [plain, first, plain, second, None, mixed, first, None, second, mixed]
     results: dict[int, Any] = {}
     for case in cases:
@@ -148,7 +144,9 @@ def test_a_call_depends_on_its_arguments_alone(scene: Scene, engine: Engine) -> 
     np.testing.assert_array_equal(few[0].qpos, two[1:3])
 
 
-def test_a_decision_is_that_of_the_c_engine(scene: Scene, engine: Engine) -> None:
+def test_a_decision_is_that_of_the_c_engine(
+    scene: Scene, engine: Engine, circumstances: Any
+) -> None:
     """State, IMU and tilt of robots under loads, against the engine that evaluates."""
     state, ctrl = held(scene, 4)
     conditions = circumstances(0, 4)
@@ -163,7 +161,9 @@ def test_a_decision_is_that_of_the_c_engine(scene: Scene, engine: Engine) -> Non
         np.testing.assert_allclose(getattr(after, name), value, rtol=1e-5, atol=1e-6)
 
 
-def test_seeds_of_envs_are_rows_of_one_batch(scene: Scene, engine: Engine) -> None:
+def test_seeds_of_envs_are_rows_of_one_batch(
+    scene: Scene, engine: Engine, circumstances: Any
+) -> None:
     state, ctrl = held(scene, 6)
     conditions = circumstances(3, 6)
     flat = moved(engine, state, ctrl, conditions)
@@ -176,7 +176,9 @@ def test_seeds_of_envs_are_rows_of_one_batch(scene: Scene, engine: Engine) -> No
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[5]), alone, flat)
 
 
-def test_two_devices_move_their_own_robots(scene: Scene, engine: Engine) -> None:
+def test_two_devices_move_their_own_robots(
+    scene: Scene, engine: Engine, circumstances: Any
+) -> None:
     """Twenty calls at once on both: the boards of each are those of one device."""
     state, ctrl = held(scene, 8)
     conditions = circumstances(4, 8)
@@ -206,7 +208,7 @@ def test_the_tilt_of_a_simulation_that_warns_is_no_number(scene: Scene, engine: 
     assert np.isfinite(motion.tilt[::2]).all()
 
 
-def test_no_leg_comes_to_its_limits(compiled: Fleet) -> None:
+def test_no_leg_comes_to_its_limits(compiled: Any) -> None:
     """MJX leaves the limits out. Half a minute of the greatest actions, each held for 2 s.
 
     Under loads of up to 5 kg and with weak servos; measured: 0.07 rad are left.
@@ -216,13 +218,13 @@ def test_no_leg_comes_to_its_limits(compiled: Fleet) -> None:
     bounds = {scene.model.jnt_qposadr[k]: scene.model.jnt_range[k] for k in range(15)}
     ranges = np.asarray([[bounds[at] for at in leg] for leg in scene.leg_qpos])
     lowest, highest = ranges[..., 0], ranges[..., 1]
-    state, rng, left = compiled.reset(keys(0)), np.random.default_rng(0), np.inf
+    state, rng, left = compiled.reset(compiled.keys(0)), np.random.default_rng(0), np.inf
     actions = rng.choice((0, 20, 420, 440), (15, ENVS)).repeat(10, axis=0)
     for number, action in enumerate(actions):
         state = compiled.step(state, jnp.asarray(action))
         angles = np.asarray(state.pipeline_state.qpos)[:, scene.leg_qpos]
         left = min(left, float(np.minimum(angles - lowest, highest - angles).min()))
-        over, fresh = np.asarray(state.done) > 0, compiled.reset(keys(1 + number))
+        over, fresh = np.asarray(state.done) > 0, compiled.reset(compiled.keys(1 + number))
         state = jax.tree.map(
             lambda new, old: jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old),  # noqa: B023
             fresh,
@@ -233,9 +235,9 @@ def test_no_leg_comes_to_its_limits(compiled: Fleet) -> None:
 
 @pytest.mark.parametrize("broken", [np.nan, 1e12])
 def test_a_robot_that_diverges_is_seen_and_leaves_the_others_alone(
-    compiled: Fleet, broken: float
+    compiled: Any, broken: float
 ) -> None:
-    start = compiled.reset(keys(2))
+    start = compiled.reset(compiled.keys(2))
     physics = start.pipeline_state
     spoilt = physics._replace(qvel=physics.qvel.at[3, 8].set(broken))
     action = jnp.full(ENVS, STAND)
@@ -281,7 +283,7 @@ def test_host_functions_see_the_buffers_themselves() -> None:
         jax.block_until_ready(call(jnp.arange(6).reshape(2, 3), jnp.float32(0.5)))
 
 
-def test_an_env_says_which_engine_it_has(compiled: Fleet) -> None:
+def test_an_env_says_which_engine_it_has(compiled: Any) -> None:
     assert compiled.env.backend == "mujoco"
     assert BalanceEnv().backend == "mjx"
     assert VARIED == ("payload", "payload_at", "friction", "gain")

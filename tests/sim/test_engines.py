@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from fleet import ENVS, EPISODE, KICKED, Feedback, Fleet
 from mujoco import mjx
 
 from mjx_balance.config import Config
@@ -23,6 +22,10 @@ from mjx_balance.task.pushes import Pushes
 from mjx_balance.task.randomization import Conditions
 from mjx_balance.task.tilt import Scenario
 
+ENVS, EPISODE = 32, 50
+KICKED = np.asarray((13, 25, 38))
+"""Decisions of an episode that begin with a kick: 2.5, 5 and 7.5 s, in decisions of 0.2 s."""
+
 
 class Course(NamedTuple):
     """What one engine gave, (decisions, ENVS, ...); before the decision, but for the tilt."""
@@ -35,7 +38,7 @@ class Course(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def courses(fleet: Fleet, closed_loop: list[Any]) -> tuple[Course, Course]:
+def courses(fleet: Any, closed_loop: list[Any]) -> tuple[Course, Course]:
     """Of MJX and of the C engine."""
     env, before, after = fleet.env, closed_loop[:-1], closed_loop[1:]
     ours = Course(
@@ -45,7 +48,7 @@ def courses(fleet: Fleet, closed_loop: list[Any]) -> tuple[Course, Course]:
         np.asarray([s.pipeline_state.qpos for s in before]),
         np.asarray([s.metrics["tilt_deg"] for s in after]),
     )
-    act, views, actions = Feedback(env.config, env.scene.robot, EPISODE), [], []
+    act, views, actions = fleet.feedback(EPISODE), [], []
 
     def watched(view: Any) -> np.ndarray:
         views.append(view)
@@ -181,7 +184,7 @@ def test_mjx_solves_as_the_config_says_and_leaves_the_scene_alone(
         np.testing.assert_allclose(getattr(state, name), stance, rtol=1e-6, atol=1e-7)
 
 
-def test_matrix_products_of_the_physics_are_exact(fleet: Fleet) -> None:
+def test_matrix_products_of_the_physics_are_exact(fleet: Any) -> None:
     """TF32 would do on a GPU what nobody asked for: all but the observation's are `highest`."""
     products = [line for line in fleet.program.splitlines() if "dot_general" in line]
     exact = [line for line in products if line.count("HIGHEST") == 2]

@@ -1,7 +1,6 @@
 """MJX-Warp inside a jitted program, on a CPU: the same physics, buffers that hold every contact."""
 
 import copy
-import dataclasses
 import importlib.util
 from typing import Any
 
@@ -9,10 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fleet import KICKED, Feedback, Fleet, drive, fleet_config, keys, nominal, under
 
 from mjx_balance.config import ConfigError
-from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.rollout import roll_out
 from mjx_balance.sim.engines import warp
 from mjx_balance.sim.engines.choice import make_engine
@@ -29,30 +26,23 @@ ENVS, DECISIONS = 8, 10
 
 
 @pytest.fixture(scope="module")
-def warped() -> Fleet:
+def warped(make_fleet: Any) -> Any:
     """The envs of `fleet`, fewer, over Warp."""
-    env = BalanceEnv(dataclasses.replace(fleet_config(), engine="warp"))
-    return Fleet(env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step)), "")
+    return make_fleet("warp", ENVS)
 
 
 @pytest.fixture(scope="module")
-def scene(warped: Fleet) -> Scene:
+def scene(warped: Any) -> Scene:
     return warped.env.scene
 
 
-def test_training_and_evaluation_have_the_same_physics(warped: Fleet) -> None:
+def test_training_and_evaluation_have_the_same_physics(warped: Any) -> None:
     """Closed loop, half of the envs nominal, half under payload, friction, gains and latency."""
     env = warped.env
-    start = warped.reset(keys(1)[:ENVS])
-    drawn = start.info["conditions"]._replace(imu_noise=jnp.zeros((ENVS, 6)))
-    plain = np.arange(ENVS) < ENVS // 2
-    mixed = [
-        np.where(plain.reshape(-1, *[1] * (b.ndim - 1)), a, b)
-        for a, b in zip(nominal(ENVS), drawn, strict=True)
-    ]
-    start = under(start, Conditions(*mixed))
-    act = Feedback(env.config, env.scene.robot, DECISIONS, ENVS)
-    states = drive(warped, start, act, DECISIONS)
+    start = warped.reset(warped.keys(1))
+    start = warped.under(start, warped.half_nominal(jax.device_get(start.info["conditions"])))
+    act = warped.feedback(DECISIONS)
+    states = warped.drive(start, act, DECISIONS)
     double = {k: np.asarray(v, float) for k, v in start.info["conditions"]._asdict().items()}
     rollout = roll_out(
         env.scene,
@@ -60,7 +50,7 @@ def test_training_and_evaluation_have_the_same_physics(warped: Fleet) -> None:
         Scenario(*(np.asarray(x, float) for x in start.info["scenario"])),
         DECISIONS * env.config.task.ctrl_dt,
         conditions=Conditions(**double),
-        pushes=Pushes(np.asarray(start.info["kicks"], float), KICKED),
+        pushes=Pushes(np.asarray(start.info["kicks"], float), np.asarray((13, 25, 38))),
         record=True,
     )
     assert rollout.qpos is not None

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fleet import walked
 
 from mjx_balance.config import Config, TaskConfig
 from mjx_balance.robots.catalogue import Robot
@@ -98,7 +97,7 @@ def test_a_standing_robot_has_always_stood(
 
 
 def test_servos_are_told_heights_and_board_step_by_step(
-    xp: types.ModuleType, task: TaskConfig, robot: Robot
+    xp: types.ModuleType, task: TaskConfig, robot: Robot, walked: Any
 ) -> None:
     before = random_memory(task)
     change = np.asarray([(0.003, -0.0012), (-0.0021, 0.0006), (0.0009, 0.0027)])

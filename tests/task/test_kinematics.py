@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from bodies import with_legs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,10 +20,10 @@ LINKS = ((0.213, 0.213), (0.213, 0.19), (0.18, 0.23))
 
 
 @pytest.fixture(params=LINKS, ids=str)
-def any_robot(robot: Robot, request: pytest.FixtureRequest) -> Robot:
+def any_robot(robot: Robot, request: pytest.FixtureRequest, bodies: types.ModuleType) -> Robot:
     """Robots with legs of other proportions too."""
     thigh, calf = request.param
-    return with_legs(robot, thigh=thigh, calf=calf)
+    return bodies.with_legs(robot, thigh=thigh, calf=calf)
 
 
 def heights_of(robot: Robot) -> np.ndarray:

@@ -5,27 +5,23 @@ import os
 import re
 import signal
 import socket
-import subprocess
 import sys
 import time
 import unittest.mock
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import pytest
 from mujoco import mjx
-from runs import end, start, wait
 
 from mjx_balance import BalanceEnv, load_policy
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.training.checkpoints import saved_steps
 
-Process: TypeAlias = subprocess.Popen[str]
 FLAGS = (
     "--preset smoke --engine mujoco --num-devices 2 --num-env-steps 4096 --eval-every 0 "
     "--eval-scenarios 4 --eval-duration 5 --checkpoint-seconds 0.5"
@@ -35,7 +31,7 @@ FLAGS = (
 class StartTwo(Protocol):
     """Starts two processes of a run."""
 
-    def __call__(self, *flags: str, seeds: tuple[int, int] = (0, 0)) -> list[Process]: ...
+    def __call__(self, *flags: str, seeds: tuple[int, int] = (0, 0)) -> list[Any]: ...
 
 
 @pytest.fixture(scope="module")
@@ -44,29 +40,24 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def start_two(cache: Path) -> Iterator[StartTwo]:
-    """None of them is left."""
-    started: list[Process] = []
-
-    def begin(*flags: str, seeds: tuple[int, int] = (0, 0)) -> list[Process]:
+def start_two(cache: Path, start_train: Any) -> StartTwo:
+    def begin(*flags: str, seeds: tuple[int, int] = (0, 0)) -> list[Any]:
         with socket.create_server(("", 0)) as server:
             address = f"localhost:{server.getsockname()[1]}"
         place = ["--coordinator", address, "--num-processes", "2", "--process-id"]
-        for k, seed in enumerate(seeds):
-            started.append(start(cache, *flags, *place, str(k), "--seed", str(seed)))
-        return started[-2:]
+        return [
+            start_train(cache, *flags, *place, str(k), "--seed", str(seed))
+            for k, seed in enumerate(seeds)
+        ]
 
-    yield begin
-    for process in started:
-        with process:
-            process.kill()
+    return begin
 
 
 @pytest.fixture(scope="module")
-def alone(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+def alone(cache: Path, tmp_path_factory: pytest.TempPathFactory, start_train: Any) -> RunFolder:
     """The run as one process with two devices makes it, profiled."""
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "alone")
-    code, said = end(start(cache, *FLAGS, "--profile", "--run-dir", str(folder.path)))
+    code, said = start_train(cache, *FLAGS, "--profile", "--run-dir", str(folder.path)).end()
     assert code == 0, said
     shares = json.loads((folder.profile / "shares.json").read_text())
     assert sum(shares.values()) == pytest.approx(1)
@@ -84,8 +75,8 @@ def test_two_processes_make_the_run_of_one_with_two_devices(
 ) -> None:
     """To the bit: each steps its 32 boards, and the sums of two gradients are the same."""
     folder = RunFolder(tmp_path / "run")
-    (code, said), (other_code, other_said) = map(
-        end, start_two(*FLAGS, "--run-dir", str(folder.path))
+    (code, said), (other_code, other_said) = (
+        each.end() for each in start_two(*FLAGS, "--run-dir", str(folder.path))
     )
     assert (code, other_code) == (0, 0), said + other_said
     assert "64 envs on 2 cpu device" in said
@@ -97,17 +88,17 @@ def test_two_processes_make_the_run_of_one_with_two_devices(
 
 
 def test_a_killed_and_a_stopped_process_lose_nothing(
-    alone: RunFolder, start_two: StartTwo, cache: Path, tmp_path: Path
+    alone: RunFolder, start_two: StartTwo, cache: Path, tmp_path: Path, start_train: Any
 ) -> None:
     """Kill -9 of the second, SIGTERM to the second, then on in one process with two devices."""
     folder = RunFolder(tmp_path / "run")
     first, second = start_two(*FLAGS, "--run-dir", str(folder.path))
-    wait(first, lambda: saved_steps(folder.checkpoints))
+    first.wait(lambda: saved_steps(folder.checkpoints))
     if sys.platform == "linux":  # gloo's thread interrupts no other one
-        assert os.sched_getscheduler(second.pid) == os.SCHED_BATCH
-    second.kill()
+        assert os.sched_getscheduler(second.process.pid) == os.SCHED_BATCH
+    second.process.kill()
     killed = time.monotonic()
-    code, said = end(first)
+    code, said = first.end()
     assert time.monotonic() - killed < 60
     assert code == 1, said
     sentence = "mjx-balance: process 1 is gone, and the run ends with it; continue with --resume"
@@ -118,16 +109,16 @@ def test_a_killed_and_a_stopped_process_lose_nothing(
     saved = max(saved_steps(folder.checkpoints))
     boards = len(list(folder.tensorboard.iterdir()))
     first, second = start_two("--resume", str(folder.path))
-    wait(first, lambda: len(list(folder.tensorboard.iterdir())) > boards)
-    second.send_signal(signal.SIGTERM)
-    (code, said), (other_code, other_said) = map(end, (first, second))
+    first.wait(lambda: len(list(folder.tensorboard.iterdir())) > boards)
+    second.process.send_signal(signal.SIGTERM)
+    (code, said), (other_code, other_said) = (each.end() for each in (first, second))
     assert (code, other_code) == (130, 130), said + other_said
     assert f"resuming at {saved:,} decisions" in said
     assert f"continue with --resume {folder.path}" in said
     stopped = load_policy(folder.policy).manifest["training"]["env_steps"]
     assert saved <= stopped == max(saved_steps(folder.checkpoints))
 
-    code, said = end(start(cache, "--resume", str(folder.path)))
+    code, said = start_train(cache, "--resume", str(folder.path)).end()
     assert code == 0, said
     assert fingerprint(folder) == fingerprint(alone)
 
@@ -157,7 +148,8 @@ def test_processes_that_were_started_differently_all_say_so(
     start_two: StartTwo, tmp_path: Path
 ) -> None:
     flags = (*FLAGS, "--run-dir", str(tmp_path / "run"))
-    for code, said in map(end, start_two(*flags, seeds=(3, 4))):
+    for process in start_two(*flags, seeds=(3, 4)):
+        code, said = process.end()
         assert code == 2, said
         assert said == (
             "mjx-balance: process 1 has seed = 4, process 0 has 3; start all with the same flags "

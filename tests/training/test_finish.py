@@ -3,22 +3,25 @@
 import dataclasses
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
-from stub_learner import CONFIG, PARAMS, SEED, Learner, state_of
 from tensorboardX.proto.event_pb2 import Event
 
 from mjx_balance import load_policy
-from mjx_balance.config import ConfigError
+from mjx_balance.config import ConfigError, preset
 from mjx_balance.evaluation.suites import SEEDS
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report.progress import Display
 from mjx_balance.training import finish
+
+CONFIG = preset("smoke")
+SEED = CONFIG.seed
 
 
 @pytest.fixture
@@ -26,27 +29,29 @@ def folder(tmp_path: Path) -> RunFolder:
     return RunFolder(tmp_path)
 
 
-def export(folder: RunFolder, *scales: float) -> tuple[list[Policy], list[str]]:
-    config = dataclasses.replace(CONFIG, num_seeds=len(scales))
-    said: list[str] = []
-    learner: Any = Learner()
-    policies = finish.export(config, learner, "hash", folder, state_of(*scales), 1.26, said.append)
-    return policies, said
+@pytest.fixture
+def export(folder: RunFolder, stub_learner: Any) -> Callable[..., tuple[list[Policy], list[str]]]:
+    """Scales of the stub's parameters -> policies, and what was said."""
+
+    def export(*scales: float) -> tuple[list[Policy], list[str]]:
+        config, said = dataclasses.replace(CONFIG, num_seeds=len(scales)), []
+        state = stub_learner.state_of(*scales)
+        policies = finish.export(config, stub_learner, "hash", folder, state, 1.26, said.append)
+        return policies, said
+
+    return export
 
 
 def first_weight(policy: Policy) -> float:
     return float(policy.layers[0][0].ravel()[0])
 
 
-FIRST = float(PARAMS["params"]["hidden_0"]["kernel"].ravel()[0])  # pyright: ignore
-
-
-def test_one_seed_gives_one_policy(folder: RunFolder) -> None:
-    [policy], said = export(folder, 2.0)
+def test_one_seed_gives_one_policy(folder: RunFolder, stub_learner: Any, export: Any) -> None:
+    [policy], said = export(2.0)
     assert said == []
     saved = load_policy(folder.policy)
     assert saved.fingerprint == policy.fingerprint
-    assert first_weight(saved) == pytest.approx(2 * FIRST)
+    assert first_weight(saved) == pytest.approx(2 * stub_learner.first_weight)
     assert saved.scene_hash == "hash"
     training = saved.manifest["training"]
     assert (training["env_steps"], training["gradient_steps"]) == (64, 192)
@@ -54,18 +59,20 @@ def test_one_seed_gives_one_policy(folder: RunFolder) -> None:
     assert not folder.seeds.exists()
 
 
-def test_every_seed_gives_a_policy_of_its_own(folder: RunFolder) -> None:
-    policies, _ = export(folder, 1.0, 2.0, 3.0)
+def test_every_seed_gives_a_policy_of_its_own(
+    folder: RunFolder, stub_learner: Any, export: Any
+) -> None:
+    policies, _ = export(1.0, 2.0, 3.0)
     for k, policy in enumerate(policies):
         saved = load_policy(folder.seed_policy(SEED + k))
         assert saved.fingerprint == policy.fingerprint
-        assert first_weight(saved) == pytest.approx((k + 1) * FIRST)
+        assert first_weight(saved) == pytest.approx((k + 1) * stub_learner.first_weight)
         assert (saved.config.seed, saved.config.num_seeds) == (SEED + k, 1)
     assert load_policy(folder.policy).fingerprint == policies[0].fingerprint
 
 
-def test_a_diverged_seed_does_not_hold_the_others_up(folder: RunFolder) -> None:
-    policies, said = export(folder, np.nan, 2.0, np.inf, 4.0)
+def test_a_diverged_seed_does_not_hold_the_others_up(folder: RunFolder, export: Any) -> None:
+    policies, said = export(np.nan, 2.0, np.inf, 4.0)
     assert [policy.config.seed for policy in policies] == [SEED + 1, SEED + 3]
     assert len(said) == 2
     assert said[0].startswith(f"seed {SEED} gives no policy: weight ")
@@ -75,9 +82,11 @@ def test_a_diverged_seed_does_not_hold_the_others_up(folder: RunFolder) -> None:
 
 
 @pytest.mark.parametrize("scales", [(np.nan,), (np.nan, np.nan)])
-def test_no_policy_at_all_is_said(folder: RunFolder, scales: tuple[float, ...]) -> None:
+def test_no_policy_at_all_is_said(
+    folder: RunFolder, scales: tuple[float, ...], export: Any
+) -> None:
     with pytest.raises(PolicyError, match="learnt no policy of finite numbers; lower learning"):
-        export(folder, *scales)
+        export(*scales)
     assert not folder.policy.exists()
 
 
@@ -128,17 +137,25 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return asked
 
 
-def finished(folder: RunFolder, *scales: float, sweep: tuple[str, ...] = ()) -> dict[str, Any]:
-    policies, _ = export(folder, *scales)
-    config = dataclasses.replace(CONFIG, num_seeds=len(scales), eval_scenarios=4, eval_duration=5.0)
-    if sweep:
-        config = dataclasses.replace(config, num_seeds=len(scales) // 2, sweep=sweep)
-    display = Display(Console(file=io.StringIO(), width=200))
-    return finish.finish(config, policies, folder, display, 0.0)
+@pytest.fixture
+def finished(folder: RunFolder, export: Any) -> Callable[..., dict[str, Any]]:
+    """Scales of the stub's parameters -> what the end of such a run returns."""
+
+    def finished(*scales: float, sweep: tuple[str, ...] = ()) -> dict[str, Any]:
+        policies, _ = export(*scales)
+        num_seeds = len(scales) // 2 if sweep else len(scales)
+        config = dataclasses.replace(CONFIG, num_seeds=num_seeds, sweep=sweep)
+        config = dataclasses.replace(config, eval_scenarios=4, eval_duration=5.0)
+        display = Display(Console(file=io.StringIO(), width=200))
+        return finish.finish(config, policies, folder, display, 0.0)
+
+    return finished
 
 
-def test_one_seed_is_evaluated_on_both_suites(folder: RunFolder, calls: list[Any]) -> None:
-    results = finished(folder, 1.0)
+def test_one_seed_is_evaluated_on_both_suites(
+    folder: RunFolder, calls: list[Any], finished: Any
+) -> None:
+    results = finished(1.0)
     seed = SEEDS.final
     assert calls == [
         (SEED, "paper", 4, 5.0, seed),
@@ -152,9 +169,9 @@ def test_one_seed_is_evaluated_on_both_suites(folder: RunFolder, calls: list[Any
 
 
 def test_the_best_seed_is_chosen_by_the_validation_alone(
-    folder: RunFolder, calls: list[Any]
+    folder: RunFolder, calls: list[Any], finished: Any
 ) -> None:
-    results = finished(folder, 1.0, 2.0, 3.0, 4.0)
+    results = finished(1.0, 2.0, 3.0, 4.0)
     assert load_policy(folder.policy).config.seed == SEED + 1
     assert ("figures", SEED + 1) in calls
     seeds = json.loads(folder.seeds_summary.read_text())
@@ -175,19 +192,21 @@ def test_the_best_seed_is_chosen_by_the_validation_alone(
     assert SEEDS.final != SEEDS.validation
 
 
-def test_a_diverged_seed_is_never_chosen(folder: RunFolder, calls: list[Any]) -> None:
-    finished(folder, 1.0, np.nan, 3.0)
+def test_a_diverged_seed_is_never_chosen(
+    folder: RunFolder, calls: list[Any], finished: Any
+) -> None:
+    finished(1.0, np.nan, 3.0)
     seeds = json.loads(folder.seeds_summary.read_text())
     assert [row["seed"] for row in seeds["seeds"]] == [SEED, SEED + 2]
     assert seeds["best"] == SEED
     assert load_policy(folder.policy).config.seed == SEED
     folder.evaluation.unlink()
-    finished(folder, 1.0, np.nan)  # the only one left needs no rival
+    finished(1.0, np.nan)  # the only one left needs no rival
     assert json.loads(folder.seeds_summary.read_text())["best"] == SEED
 
 
 def test_a_run_killed_while_it_finishes_finishes_again(
-    folder: RunFolder, calls: list[Any], monkeypatch: pytest.MonkeyPatch
+    folder: RunFolder, calls: list[Any], monkeypatch: pytest.MonkeyPatch, finished: Any
 ) -> None:
     """It counts as finished only once all is written, and TensorBoard has it once."""
 
@@ -200,12 +219,12 @@ def test_a_run_killed_while_it_finishes_finishes_again(
     with monkeypatch.context() as patch:
         patch.setattr(finish, "_draw", die)
         with pytest.raises(Killed):
-            finished(folder, 1.0)
+            finished(1.0)
     assert not folder.evaluation.exists()
     # TensorBoard's names count seconds: two runs within one would hide a file that is left.
     for number, file in enumerate(list((folder.tensorboard / "final").iterdir())):
         file.rename(file.with_name(f"events.out.tfevents.{number}.earlier"))
-    finished(folder, 1.0)
+    finished(1.0)
     tags: list[str] = []
     for file in (folder.tensorboard / "final").iterdir():
         content = file.read_bytes()
@@ -220,11 +239,11 @@ def test_a_run_killed_while_it_finishes_finishes_again(
 
 
 def test_a_sweep_is_ranked_by_falls_and_tilt_of_its_seeds(
-    folder: RunFolder, calls: list[Any], monkeypatch: pytest.MonkeyPatch
+    folder: RunFolder, calls: list[Any], monkeypatch: pytest.MonkeyPatch, finished: Any
 ) -> None:
     """Four runs: two values of gamma with two seeds each."""
     monkeypatch.setitem(VALIDATION, SEED, (0, 0.9))
-    finished(folder, 1.0, 2.0, 3.0, 4.0, sweep=("gamma=0.1,0.4",))
+    finished(1.0, 2.0, 3.0, 4.0, sweep=("gamma=0.1,0.4",))
     best, worst = json.loads(folder.sweep.read_text())
     assert [x["values"] for x in (best, worst)] == [{"gamma": 0.1}, {"gamma": 0.4}]
     # All fall equally often in the evaluation; 1 - 0.9 and 1 - 0.4, and 1 - 0.1 and 1 - 0.6.

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import bodies
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -199,7 +198,7 @@ def test_every_other_number_changes_the_key(monkeypatch: pytest.MonkeyPatch) -> 
     assert len(keys) == count > 60
 
 
-def test_another_model_of_a_robot_changes_the_key(tmp_path: Path) -> None:
+def test_another_model_of_a_robot_changes_the_key(tmp_path: Path, bodies: Any) -> None:
     """Its file and its name are the same."""
     spec = bodies.our_spec()
     keys = set()

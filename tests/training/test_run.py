@@ -4,12 +4,11 @@ import json
 import os
 import re
 import signal
-import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from runs import end, interrupt, start
 
 from mjx_balance import load_policy
 from mjx_balance.files.run_folder import RunFolder
@@ -32,14 +31,14 @@ def cores() -> int:
 
 
 @pytest.fixture(scope="module")
-def run(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+def run(cache: Path, tmp_path_factory: pytest.TempPathFactory, start_train: Any) -> RunFolder:
     """A finished run; it fills the cache."""
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "run")
-    done = end(start(cache, *FLAGS, "--run-dir", str(folder.path)))
-    assert done.code == 0, done.said
-    assert "Failed to import" not in done.said
-    used = re.search(r"preset smoke, seed 0, 64 envs on (\d+) (\w+) device", done.said)
-    assert used is not None, done.said
+    code, said = start_train(cache, *FLAGS, "--run-dir", str(folder.path)).end()
+    assert code == 0, said
+    assert "Failed to import" not in said
+    used = re.search(r"preset smoke, seed 0, 64 envs on (\d+) (\w+) device", said)
+    assert used is not None, said
     if used[2] == "cpu":  # as many cores as share 64 envs evenly
         assert int(used[1]) == max(n for n in (1, 2, 4, 8, 16, 32, 64) if n <= cores())
     return folder
@@ -106,20 +105,22 @@ def files(folder: Path) -> set[str]:
 
 
 def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
-    run: RunFolder, cache: Path, tmp_path: Path
+    run: RunFolder, cache: Path, tmp_path: Path, start_train: Any
 ) -> None:
     """As soon as its folder exists, after a checkpoint, by Ctrl-C, and while it evaluates."""
     folder = RunFolder(tmp_path / "run")
     cached = files(cache)
-    first = start(cache, *FLAGS, "--run-dir", str(folder.path))
-    done = interrupt(first, signal.SIGKILL, folder.path.exists)
-    assert not folder.checkpoints.exists(), done.said
+    first = start_train(cache, *FLAGS, "--run-dir", str(folder.path))
+    _, said = first.interrupt(signal.SIGKILL, folder.path.exists)
+    assert not folder.checkpoints.exists(), said
 
-    def resume() -> subprocess.Popen[str]:
-        return start(cache, "--resume", str(folder.path))
+    def resume() -> Any:
+        return start_train(cache, "--resume", str(folder.path))
 
-    done = interrupt(resume(), signal.SIGKILL, lambda: list(folder.checkpoints.glob("[0-9]???")))
-    assert done.code == -signal.SIGKILL, done.said
+    code, said = resume().interrupt(
+        signal.SIGKILL, lambda: list(folder.checkpoints.glob("[0-9]???"))
+    )
+    assert code == -signal.SIGKILL, said
     assert len(lines(folder)) < 6, "the kill came too late to show anything"
 
     saved = max(saved_steps(folder.checkpoints))
@@ -127,20 +128,20 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
     at_work = resume()
     # A TensorBoard file is opened when the loop begins.
     begun = lambda: len(list(folder.tensorboard.iterdir())) > before  # noqa: E731
-    done = interrupt(at_work, signal.SIGINT, begun)
-    assert done.code == 130, done.said
-    assert f"continue with --resume {folder.path}" in done.said
+    code, said = at_work.interrupt(signal.SIGINT, begun)
+    assert code == 130, said
+    assert f"continue with --resume {folder.path}" in said
     so_far = load_policy(folder.policy).manifest["training"]["env_steps"]
     assert saved <= so_far <= 6144
-    assert f"resuming at {saved:,} decisions" in done.said
+    assert f"resuming at {saved:,} decisions" in said
 
-    done = interrupt(resume(), signal.SIGKILL, (folder.checkpoints / "6144").is_dir)
-    assert done.code == -signal.SIGKILL, done.said
+    code, said = resume().interrupt(signal.SIGKILL, (folder.checkpoints / "6144").is_dir)
+    assert code == -signal.SIGKILL, said
     assert not folder.evaluation.exists()
 
-    done = end(resume())
-    assert done.code == 0, done.said
-    assert "resuming at 6,144 decisions" in done.said
+    code, said = resume().end()
+    assert code == 0, said
+    assert "resuming at 6,144 decisions" in said
     assert load_policy(folder.policy).fingerprint == load_policy(run.policy).fingerprint
     assert [x["env_steps"] for x in lines(folder)] == list(range(1024, 6145, 1024))
     assert held_out(folder) == held_out(run)
@@ -153,4 +154,4 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
     # Five starts, and nothing was traced or compiled again.
     new = {name for name in files(cache) - cached if "jit_call" in name or "programs" in name}
     assert not new
-    assert "cpu_aot_loader" not in done.said  # XLA's chatter about what it cached
+    assert "cpu_aot_loader" not in said  # XLA's chatter about what it cached

@@ -3,20 +3,20 @@
 import dataclasses
 import io
 import random
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
-from brax.envs.base import State
+from brax.envs.base import Env, State
 from rich.console import Console
-from stub_learner import CONFIG, OBS, PARAMS, SEED, Learner, state_of
 
 from mjx_balance import load_policy
-from mjx_balance.dqn.learner import Learner as RealLearner
+from mjx_balance.config import preset
+from mjx_balance.dqn.learner import Learner
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.suites import SEEDS
@@ -27,6 +27,8 @@ from mjx_balance.training import finish, loop
 from mjx_balance.training.loop import Interrupts
 from mjx_balance.training.validation import best_validated, scalars, score, validate
 
+CONFIG = preset("smoke")
+SEED = CONFIG.seed
 SHORT = dataclasses.replace(CONFIG, validation_scenarios=2, validation_duration=3.0)
 
 
@@ -72,12 +74,12 @@ def test_what_is_logged_has_a_name_for_each_suite_and_statistic() -> None:
 
 
 def test_every_seed_is_validated_as_its_exported_policy_is_evaluated(
-    scene: Scene, folder: RunFolder
+    scene: Scene, folder: RunFolder, stub_learner: Any
 ) -> None:
     """And the policy that is kept carries what came of it; a seed that diverged has none."""
     config = dataclasses.replace(SHORT, num_seeds=3)
-    learner: Any = Learner()
-    found = validate(config, learner, scene, folder, state_of(1.0, np.nan, -3.0, env_steps=128))
+    state = stub_learner.state_of(1.0, np.nan, -3.0, env_steps=128)
+    found = validate(config, stub_learner, scene, folder, state)
     assert {name.split("/")[1] for name in found} == {"paper", "corner"}
     assert all(np.isnan(values).tolist() == [False, True, False] for values in found.values())
     means = found["eval/corner/tilt_mean"]
@@ -101,25 +103,31 @@ def test_every_seed_is_validated_as_its_exported_policy_is_evaluated(
         assert carried == wanted
 
 
-def keep(folder: RunFolder, env_steps: int, falls: int, mean: float, seed: int = SEED) -> None:
+@pytest.fixture
+def keep(folder: RunFolder, stub_learner: Any) -> Callable[..., None]:
     """Keeps a policy that validated so; its weights are multiples of the decisions."""
-    results = {"paper": result(falls, mean), "corner": result(0, mean)}
-    own = dataclasses.replace(CONFIG, seed=seed)
-    manifest = make_manifest(own, "hash", {"env_steps": env_steps, "validation": results})
-    file = folder.validated_policy(seed, env_steps)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    save_policy(file, jax.device_get(state_of(float(env_steps)).params), manifest)
+
+    def keep(env_steps: int, falls: int, mean: float, seed: int = SEED) -> None:
+        results = {"paper": result(falls, mean), "corner": result(0, mean)}
+        own = dataclasses.replace(CONFIG, seed=seed)
+        manifest = make_manifest(own, "hash", {"env_steps": env_steps, "validation": results})
+        file = folder.validated_policy(seed, env_steps)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        params = stub_learner.state_of(float(env_steps)).params
+        save_policy(file, jax.device_get(params), manifest)
+
+    return keep
 
 
-def test_the_best_validated_policy_of_a_seed_is_found(folder: RunFolder) -> None:
+def test_the_best_validated_policy_of_a_seed_is_found(folder: RunFolder, keep: Any) -> None:
     assert best_validated(folder, SEED, pytest.fail) is None
-    keep(folder, 900, 1, 0.1)
+    keep(900, 1, 0.1)
     assert best_validated(folder, SEED, pytest.fail) == folder.validated_policy(SEED, 900)
-    keep(folder, 1_000, 0, 0.3)
-    keep(folder, 2_000, 0, 0.2)
-    keep(folder, 10_000, 0, 0.2)  # as good, later
-    keep(folder, 20_000, 0, 0.25)
-    keep(folder, 30_000, 0, 0.1, SEED + 1)
+    keep(1_000, 0, 0.3)
+    keep(2_000, 0, 0.2)
+    keep(10_000, 0, 0.2)  # as good, later
+    keep(20_000, 0, 0.25)
+    keep(30_000, 0, 0.1, SEED + 1)
     assert best_validated(folder, SEED, pytest.fail) == folder.validated_policy(SEED, 2_000)
     assert best_validated(folder, SEED + 1, pytest.fail) == folder.validated_policy(
         SEED + 1, 30_000
@@ -132,32 +140,40 @@ def test_the_best_validated_policy_of_a_seed_is_found(folder: RunFolder) -> None
     assert said[0].startswith(f"not chosen from: {damaged} is damaged")
 
 
-def exported(folder: RunFolder, export: Any, *scales: float) -> tuple[list[float], list[str]]:
+@pytest.fixture
+def exported(folder: RunFolder, stub_learner: Any) -> Callable[..., tuple[list[float], list[str]]]:
     """First weights of the policies handed out, as multiples of the stub's; and what was said."""
-    config = dataclasses.replace(CONFIG, num_seeds=len(scales), export=export)
-    said: list[str] = []
-    learner: Any = Learner()
-    policies = finish.export(config, learner, "hash", folder, state_of(*scales), 1.0, said.append)
-    first = PARAMS["params"]["hidden_0"]["kernel"].ravel()[0]  # pyright: ignore
-    return [float(p.layers[0][0].ravel()[0] / first) for p in policies], said
+
+    def exported(export: Any, *scales: float) -> tuple[list[float], list[str]]:
+        config = dataclasses.replace(CONFIG, num_seeds=len(scales), export=export)
+        state, said = stub_learner.state_of(*scales), []
+        policies = finish.export(config, stub_learner, "hash", folder, state, 1.0, said.append)
+        first = stub_learner.first_weight
+        return [float(p.layers[0][0].ravel()[0] / first) for p in policies], said
+
+    return exported
 
 
-def test_the_run_hands_out_its_last_policy_or_its_best(folder: RunFolder) -> None:
-    keep(folder, 1_000, 0, 0.1)
-    keep(folder, 2_000, 0, 0.2)
-    assert exported(folder, "last", 7.0) == ([pytest.approx(7)], [])
+def test_the_run_hands_out_its_last_policy_or_its_best(
+    folder: RunFolder, keep: Any, exported: Any
+) -> None:
+    keep(1_000, 0, 0.1)
+    keep(2_000, 0, 0.2)
+    assert exported("last", 7.0) == ([pytest.approx(7)], [])
     assert load_policy(folder.policy).manifest["training"]["env_steps"] == 64
     said = [f"seed {SEED}: of 1000 decisions, the best by validation"]
-    assert exported(folder, "best", 7.0) == ([pytest.approx(1_000)], said)
+    assert exported("best", 7.0) == ([pytest.approx(1_000)], said)
     best = folder.validated_policy(SEED, 1_000)
     assert folder.policy.read_bytes() == best.read_bytes()
 
 
-def test_each_of_several_seeds_hands_out_its_own_best(folder: RunFolder) -> None:
+def test_each_of_several_seeds_hands_out_its_own_best(
+    folder: RunFolder, keep: Any, exported: Any
+) -> None:
     """The second has validated nothing yet, the third has diverged since."""
-    keep(folder, 1_000, 0, 0.1)
-    keep(folder, 2_000, 0, 0.2, SEED + 2)
-    found, said = exported(folder, "best", 5.0, 6.0, np.nan)
+    keep(1_000, 0, 0.1)
+    keep(2_000, 0, 0.2, SEED + 2)
+    found, said = exported("best", 5.0, 6.0, np.nan)
     assert found == pytest.approx([1_000, 6, 2_000])
     assert len(said) == 2
     for k, env_steps in enumerate((1_000, 64, 2_000)):
@@ -167,24 +183,31 @@ def test_each_of_several_seeds_hands_out_its_own_best(folder: RunFolder) -> None
     assert folder.policy.read_bytes() == folder.seed_policy(SEED).read_bytes()
 
 
-class Blind(probes.Probe):
-    """Random observations of the robot's size; 441 actions, of which the first half pays."""
+class Blind(Env):
+    """Random observations of a robot's size; 441 actions, of which the first half pays."""
 
-    observation_size = OBS  # pyright: ignore
-    action_size = 441  # pyright: ignore
+    action_size, backend = 441, "probe"  # pyright: ignore
+
+    def __init__(self, observation_size: int):
+        self.size = observation_size
+
+    @property
+    def observation_size(self) -> int:
+        return self.size
 
     def reset(self, rng: jax.Array) -> State:
-        measured = dict.fromkeys(("tilt_deg", "fall"), jnp.float32(0.0))
-        state = super().reset(rng)
-        return state.replace(obs=jax.random.normal(rng, (OBS,)), metrics=measured)
+        zero = jnp.float32(0.0)
+        obs = jax.random.normal(rng, (self.size,))
+        metrics = {"tilt_deg": zero, "fall": zero}
+        return State(None, obs, zero, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: jax.Array) -> State:
-        after = self._next(state, 0.0, 1.0 * (action < 220), terminated=1.0)
-        return after.replace(obs=-jnp.asarray(state.obs))
+        reward = jnp.float32(action < 220)
+        return state.replace(obs=-jnp.asarray(state.obs), reward=reward, done=jnp.float32(1.0))
 
 
 def test_learning_is_the_same_bit_for_bit_with_and_without_validation(
-    scene: Scene, tmp_path: Path
+    scene: Scene, tmp_path: Path, stub_learner: Any
 ) -> None:
     """Two seeds on two devices: weights, optimiser, replay, random keys, everything."""
     dqn = dataclasses.replace(CONFIG.dqn, batch_size=32, replay_ratio=8, min_replay_size=32)
@@ -192,7 +215,16 @@ def test_learning_is_the_same_bit_for_bit_with_and_without_validation(
     config = dataclasses.replace(SHORT, num_seeds=2, num_envs=16, num_env_steps=192, log_every=64)
     config = dataclasses.replace(config, dqn=dqn)
     network = QNetwork((8,), (21, 21), radial=True)
-    learner = RealLearner(Blind(), network, dqn, 16, 192, jax.devices(), 2, action_factors=(21, 21))
+    learner = Learner(
+        Blind(stub_learner.obs_size),
+        network,
+        dqn,
+        16,
+        192,
+        jax.devices(),
+        2,
+        action_factors=(21, 21),
+    )
     program = learner.train_program(4)
     calls: list[int] = []
 

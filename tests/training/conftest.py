@@ -1,0 +1,111 @@
+"""Fixtures of the tests of training: whole runs as processes, and a learner that learns nothing."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from mjx_balance.config import preset
+from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.robots.catalogue import find_robot
+from mjx_balance.task.observation import observation_names
+
+REPO = Path(__file__).parents[2]
+PATIENCE_S = 300.0
+
+
+class TrainProcess:
+    """`train.py` as a user starts it, with a program cache of its own."""
+
+    def __init__(self, cache: Path, *flags: str):
+        """Starts it."""
+        environment = os.environ | {"MJX_BALANCE_CACHE": str(cache)}
+        environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # JAX, imported here, has set it
+        self.process = subprocess.Popen(
+            [sys.executable, str(REPO / "train.py"), *flags],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def end(self) -> tuple[int, str]:
+        """Waits for its end; exit code and output, but for gloo's own line."""
+        output, _ = self.process.communicate(timeout=PATIENCE_S)
+        lines = [line for line in output.splitlines() if not line.startswith("[Gloo]")]
+        return self.process.returncode, "\n".join(lines)
+
+    def wait(self, when: Callable[[], object]) -> None:
+        """Until something is the case, or the process has ended."""
+        until = time.monotonic() + PATIENCE_S
+        while not when() and self.process.poll() is None and time.monotonic() < until:
+            time.sleep(0.02)
+
+    def interrupt(self, number: int, when: Callable[[], object]) -> tuple[int, str]:
+        """Sends a signal as soon as something is the case."""
+        self.wait(when)
+        self.process.send_signal(number)
+        return self.end()
+
+
+@pytest.fixture(scope="module")
+def start_train() -> Iterator[Callable[..., TrainProcess]]:
+    """Path of a cache, flags -> `TrainProcess`; those that still run are killed at the end."""
+    started: list[TrainProcess] = []
+
+    def start(cache: Path, *flags: str) -> TrainProcess:
+        started.append(TrainProcess(cache, *flags))
+        return started[-1]
+
+    yield start
+    for each in started:
+        with each.process as process:
+            process.kill()
+
+
+class StubState(NamedTuple):
+    """A state that holds nothing but the parameters that are exported."""
+
+    params: Any
+    env_steps: Any
+    gradient_steps: Any
+    env_state: Any
+    replay: Any
+
+
+class StubLearner:
+    """Exports the parameters of its state as they are."""
+
+    def __init__(self) -> None:
+        """A network of the preset `smoke`."""
+        config = preset("smoke")
+        self.network = QNetwork(config.dqn.hidden_sizes, (21, 21), radial=True)
+        self.obs_size = len(observation_names(config.task, find_robot(config.robot)))
+        self.params: Any = self.network.init(jax.random.PRNGKey(0), jnp.zeros(self.obs_size))
+        self.first_weight = float(self.params["params"]["hidden_0"]["kernel"].ravel()[0])
+
+    def exported(self, state: StubState) -> Any:
+        """The parameters."""
+        assert state.env_state is None  # may be gigabytes
+        assert state.replay is None
+        return state.params
+
+    def state_of(self, *scales: float, env_steps: int = 64) -> Any:
+        """Of as many seeds, parameters times a scale: not a number, for a seed that diverged."""
+        count = jnp.full(len(scales), env_steps)
+        params = jax.tree.map(lambda x: jnp.stack([x * scale for scale in scales]), self.params)
+        state = StubState(params, count, 3 * count, count, count)
+        return state if len(scales) > 1 else jax.tree.map(lambda x: x[0], state)
+
+
+@pytest.fixture(scope="session")
+def stub_learner() -> StubLearner:
+    """A learner whose state holds nothing but the parameters that it exports."""
+    return StubLearner()
