@@ -9,13 +9,16 @@ RUNTIME := $(VENV)/.installed-$(EXTRAS)
 DEV := $(VENV)/.installed-dev-$(EXTRAS)
 DOCS := $(VENV)/.installed-docs
 
-.PHONY: train test check docs dist bench bugs mutants format clean
+.PHONY: train test test-slow check docs dist bench bugs mutants format clean
 
 train: $(RUNTIME)
 	$(BIN)/python train.py $(ARGS)
 
 test: $(DEV)
 	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder $(ARGS)
+
+test-slow: $(DEV)
+	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder -m "slow and not sb3 and not long" $(ARGS)
 
 check: $(DEV)
 	$(BIN)/ruff check .

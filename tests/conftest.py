@@ -33,18 +33,19 @@ FLEET = (
     "test_stagger",
 )
 """Files that share the fixture `fleet`, which takes a minute to compile."""
-SLOW = ("test_run", "test_learning", *FLEET, "dqn")
+FIRST = ("test_run", "test_distributed", "test_learning", *FLEET, "dqn", "test_page")
 """Files and folders that begin first, so that the last of several processes is not left alone."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts the slow files first."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Puts what takes long first, where several processes share the tests."""
 
     def rank(item: pytest.Item) -> int:
         names = (item.path.stem, item.path.parent.name)
-        return next((k for k, name in enumerate(SLOW) if name in names), len(SLOW))
+        return next((k for k, name in enumerate(FIRST) if name in names), len(FIRST))
 
-    items.sort(key=rank)
+    if hasattr(config, "workerinput"):
+        items.sort(key=rank)
 
 
 @pytest.hookimpl(optionalhook=True)

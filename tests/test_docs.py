@@ -315,7 +315,13 @@ def name_of(page: Path) -> str:
     return str(page.relative_to(REPO))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x.parent == DOCS else (), id=name_of(x))
+        for x in PAGES
+    ],
+)
 @pytest.mark.usefixtures("folder", "short")
 def test_snippets_run(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
     namespace: dict[str, Any] = {"__name__": "snippet"}

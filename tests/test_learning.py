@@ -19,6 +19,8 @@ from mjx_balance.sim.scene import Scene
 from mjx_balance.task.observation import observation_names
 from mjx_balance.training.sizing import make_learner, size_to_device
 
+pytestmark = pytest.mark.slow
+
 ENVS, DECISIONS, CALLS = 64, 8_192, 4
 ROUNDS = DECISIONS // ENVS
 

@@ -10,6 +10,8 @@ import pytest
 
 from mjx_balance.robots.catalogue import shipped
 
+pytestmark = pytest.mark.slow
+
 REPO = Path(__file__).resolve().parent.parent
 MOST_BYTES = 3_000_000
 

@@ -305,6 +305,7 @@ def test_a_full_disk_leaves_no_half_robot(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_robots_draft_can_be_checked_and_trained(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -325,6 +326,7 @@ def test_a_robots_draft_can_be_checked_and_trained(
     assert capsys.readouterr().out == Path("rex.toml").read_text()
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_hold_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

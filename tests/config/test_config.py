@@ -434,6 +434,7 @@ def any_value(kind: Any) -> st.SearchStrategy:
     return st.one_of(*(st.none() if k is type(None) else any_value(k) for k in kind.__args__))
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @given(config=any_value(Config))
 def test_any_config_survives_json(config: Config) -> None:

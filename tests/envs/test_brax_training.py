@@ -61,6 +61,7 @@ def states(env: BalanceEnv) -> list[Any]:
     return wrapped_states(wrap(env, EPISODE), 2 * EPISODE)
 
 
+@pytest.mark.slow
 def test_a_continuous_action_on_the_grid_does_what_its_index_does(env: BalanceEnv) -> None:
     index = jnp.array([0, 20, 220, 225, 300, 440])
     shares = jnp.stack(jnp.divmod(index, 21), axis=-1) / 10 - 1
@@ -103,6 +104,7 @@ def test_brax_sees_falls_end_episodes_and_the_clock_cut_them_off(states: list[An
         np.testing.assert_array_equal(cut[:, k], expected)
 
 
+@pytest.mark.slow
 def test_after_its_end_an_episode_is_as_after_a_reset(env: BalanceEnv, states: list[Any]) -> None:
     """Physics, observation, memories and clock; the scenario is another one each time."""
     fresh = jax.device_get(jax.vmap(env.reset)(keys(ENVS)))
@@ -124,6 +126,7 @@ def test_after_its_end_an_episode_is_as_after_a_reset(env: BalanceEnv, states: l
     assert len(begun) == len(ends)
 
 
+@pytest.mark.slow
 def test_the_next_episode_goes_as_its_scenario_says(env: BalanceEnv, states: list[Any]) -> None:
     """What an env does that was reset by hand and given the same scenario."""
     n = EPISODE
@@ -136,6 +139,7 @@ def test_the_next_episode_goes_as_its_scenario_says(env: BalanceEnv, states: lis
         np.testing.assert_array_equal(plain.reward[LIFTING:], after.reward[LIFTING:])
 
 
+@pytest.mark.slow
 def test_circumstances_are_drawn_anew_too() -> None:
     ranges = RandomizationConfig(payload=5.0, gyro_noise=0.01, push_max=0.2, push_period=0.4)
     found = wrapped_states(wrap(BalanceEnv(short(ranges), "continuous"), EPISODE), EPISODE)
@@ -147,6 +151,7 @@ def test_circumstances_are_drawn_anew_too() -> None:
             assert (a[k] != b[k]).any()
 
 
+@pytest.mark.slow
 def test_an_action_can_be_repeated(env: BalanceEnv) -> None:
     """Two decisions a step, of which the time limit counts every one."""
     found = wrapped_states(wrap(env, EPISODE, 2), EPISODE // 2)
@@ -154,6 +159,7 @@ def test_an_action_can_be_repeated(env: BalanceEnv) -> None:
     assert found[1].info["decision"].tolist() == [2] * ENVS
 
 
+@pytest.mark.slow
 def test_braxs_own_wrapping_would_not_do(env: BalanceEnv) -> None:
     """It leaves memory and clock as the last episode had them: why `wrap` is there."""
     found = wrapped_states(envs.training.wrap(env, EPISODE), EPISODE + 2)

@@ -119,6 +119,7 @@ def test_gymnasium_finds_nothing_to_warn_of(kind: str, screen: list[Screen]) -> 
     assert not screen[0].open
 
 
+@pytest.mark.slow
 def test_the_package_is_enough_and_imports_no_gymnasium() -> None:
     """Whichever is imported first, and though somebody has only looked whether there is one."""
     make = f"gymnasium.make({ENV!r}).unwrapped, gymnasium.make_vec({ENV!r})"
@@ -546,6 +547,7 @@ def test_another_robot_brings_its_size(kind: Any) -> None:
     assert np.abs(obs[:4]).max() < 0.5, "it stands at the height from which heights are counted"
 
 
+@pytest.mark.slow
 def test_pictures_are_of_now(env: Any) -> None:
     with pytest.warns(UserWarning, match="without a render_mode"):
         assert env.unwrapped.render() is None

@@ -256,6 +256,7 @@ def test_controllers_by_name(scene: Scene) -> None:
     assert forecasts == [at_this_rate, as_it_will_be]
 
 
+@pytest.mark.slow
 def test_knowing_more_means_tilting_less(scene: Scene) -> None:
     mean, falls = {}, {}
     for name in CONTROLLERS:
@@ -269,6 +270,7 @@ def test_knowing_more_means_tilting_less(scene: Scene) -> None:
     assert mean["rate-oracle"] < 0.1
 
 
+@pytest.mark.slow
 def test_the_oracles_know_of_latency(scene: Scene) -> None:
     """A controller that does not takes back the same tilt twice."""
 

@@ -749,6 +749,7 @@ def test_imu_noise_has_the_size_asked_for_and_is_seen_by_the_controller(
     np.testing.assert_allclose(seen[-1].obs[:, 16], newest, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_envelope_of_standing_still(scene: Scene) -> None:
     """Who never moves falls where 6 deg are passed: from 4.25 deg on both axes at once."""
     found = envelope(scene, always(STAND), 1, 12.0, 0)

@@ -77,7 +77,7 @@ def policy(request: pytest.FixtureRequest) -> Policy:
     return make_policy(request.param)
 
 
-@pytest.mark.parametrize("batch", [1, 10_000])
+@pytest.mark.parametrize("batch", [pytest.param(1, marks=pytest.mark.slow), 10_000])
 def test_values_and_actions_equal_numpys(
     policy: Policy, batch: int, observations: np.ndarray
 ) -> None:

@@ -32,7 +32,13 @@ def test_policy_fits_in_the_repository_and_to_the_scene(path: Path) -> None:
     assert policy.config.task == preset("best").task
 
 
-@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=() if path.stem == "best" else pytest.mark.slow, id=path.name)
+        for path in POLICIES
+    ],
+)
 @pytest.mark.parametrize(
     ("suite", "mean", "most"),
     [

@@ -33,6 +33,7 @@ def test_a_picture_shows_a_tilted_board(config: Config, scene: Scene, tmp_path: 
     assert np.mean(level != tilted) > 0.02
 
 
+@pytest.mark.slow
 def test_a_video_shows_the_states_in_order_at_real_speed(
     config: Config, scene: Scene, tmp_path: Path, read_video: Any
 ) -> None:
@@ -48,6 +49,7 @@ def test_a_video_shows_the_states_in_order_at_real_speed(
     assert steps[5] > 10 * max(x for k, x in enumerate(steps) if k != 5)
 
 
+@pytest.mark.slow
 def test_a_video_of_a_slower_simulation_plays_at_real_speed(
     config: Config, scene: Scene, tmp_path: Path, read_video: Any
 ) -> None:
@@ -66,6 +68,7 @@ def test_no_backend_gives_one_sentence(
     assert not (tmp_path / "never.png").exists()
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_no_matter_of_opengl(
     config: Config, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

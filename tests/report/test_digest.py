@@ -47,6 +47,7 @@ def test_the_code_that_decides_a_result_is_in_its_digest(
     assert (changed != code_digest()) == decides
 
 
+@pytest.mark.slow
 def test_comments_do_not_decide_a_result(copied: Path) -> None:
     assert code_digest(copied) == code_digest(), "wherever the package lies"
     file = copied / "task" / "tilt.py"

@@ -137,6 +137,7 @@ def test_what_was_measured_is_kept(
 HOSTILE = "<img src=x onerror=alert(1)>"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "where",
     [
@@ -182,6 +183,7 @@ def test_what_was_not_measured_is_refused(
             measuring.kept(saved)
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_measured_again(
     policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
 ) -> None:

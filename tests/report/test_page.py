@@ -79,6 +79,7 @@ def written(run: Path) -> Path:
     return run / "report.html"
 
 
+@pytest.mark.slow
 def test_everything_is_there(written: Path) -> None:
     text = written.read_text()
     titles = re.findall(r"<h2>(.*?)</h2>", text)
@@ -272,6 +273,7 @@ def test_the_video_is_of_a_scenario_that_was_measured(
     assert asked == [(policy, "corner", 12.0, 4_000_000)]
 
 
+@pytest.mark.slow
 def test_the_first_run_that_has_a_policy_is_shown(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, metrics_line: Any
 ) -> None:
@@ -363,6 +365,7 @@ def test_the_commands_make_everything_again(run: Path, config: Config) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_reward_is_said_to_be_taken_where_it_is(config: Config) -> None:
     for where, said in (
         ("end", "taken at the decision's end."),
@@ -373,6 +376,7 @@ def test_the_reward_is_said_to_be_taken_where_it_is(config: Config) -> None:
         assert picture.caption.endswith(said)
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_from_elsewhere(written: Path) -> None:
     text = re.sub(r'"data:[^"]*"', '""', written.read_text())
     assert not re.findall(r"(?:src|href)=\"[^\"]+\"", text)
@@ -380,6 +384,7 @@ def test_the_page_needs_nothing_from_elsewhere(written: Path) -> None:
     assert "<script" not in text
 
 
+@pytest.mark.slow
 def test_what_is_shown_is_what_was_measured_and_kept(run: Path, written: Path) -> None:
     results = json.loads((run / "report.json").read_text())["results"]
     rows = Tables(written.read_text()).found[0][2:]
@@ -535,6 +540,7 @@ def browse(browser: str, page: str, folder: Path) -> tuple[str, set[str], Path]:
     return done.stderr, asked, shot
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_a_browser_shows_it_without_errors_or_requests(written: Path, tmp_path: Path) -> None:
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
@@ -548,6 +554,7 @@ def test_a_browser_shows_it_without_errors_or_requests(written: Path, tmp_path: 
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 500, "it is not blank"
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_the_browser_check_can_fail(tmp_path: Path) -> None:
     """A page that asks for a picture and throws is noticed."""

@@ -328,6 +328,7 @@ def test_a_damaged_folder_is_read_as_far_as_it_goes(
 UNITS = (b"[", b"[],", b"9", b"\n", b'{"a":', b"\xff", b'"', b"{}\n", b"1e9,")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("name", ["config.json", "evaluation.json", "metrics.jsonl", "seeds.json"])
 def test_a_flood_is_refused_soon_and_in_little_memory(
@@ -354,6 +355,7 @@ def test_a_flood_is_refused_soon_and_in_little_memory(
         assert peak < (12 if name == "metrics.jsonl" else 150) * 2**20
 
 
+@pytest.mark.slow
 def test_a_flood_that_is_a_run_is_read_soon_and_in_little_memory(
     tmp_path: Path, metrics_line: Any
 ) -> None:

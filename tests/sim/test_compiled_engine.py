@@ -208,6 +208,7 @@ def test_the_tilt_of_a_simulation_that_warns_is_no_number(scene: Scene, engine: 
     assert np.isfinite(motion.tilt[::2]).all()
 
 
+@pytest.mark.slow
 def test_no_leg_comes_to_its_limits(compiled: Any) -> None:
     """MJX leaves the limits out. Half a minute of the greatest actions, each held for 2 s.
 

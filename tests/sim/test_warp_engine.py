@@ -19,7 +19,7 @@ from mjx_balance.task.pushes import Pushes
 from mjx_balance.task.randomization import Conditions
 from mjx_balance.task.tilt import Scenario
 
-pytestmark = pytest.mark.warp
+pytestmark = [pytest.mark.warp, pytest.mark.slow]
 pytest.importorskip("warp", reason="needs warp-lang, the extra `warp`")
 
 ENVS, DECISIONS = 8, 10

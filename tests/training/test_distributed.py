@@ -22,6 +22,8 @@ from mjx_balance import BalanceEnv, load_policy
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.training.checkpoints import saved_steps
 
+pytestmark = pytest.mark.slow
+
 FLAGS = (
     "--preset smoke --engine mujoco --num-devices 2 --num-env-steps 4096 --eval-every 0 "
     "--eval-scenarios 4 --eval-duration 5 --checkpoint-seconds 0.5"

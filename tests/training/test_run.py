@@ -104,6 +104,7 @@ def files(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
     run: RunFolder, cache: Path, tmp_path: Path, start_train: Any
 ) -> None:
