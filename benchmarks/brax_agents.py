@@ -123,7 +123,8 @@ def our_rows(name: str, budgets: Sequence[float], seed: int) -> Iterator[dict[st
     import jax
 
     from mjx_balance.envs.balance import BalanceEnv
-    from mjx_balance.policy.file import make_manifest, save_policy
+    from mjx_balance.policy.file import save_policy
+    from mjx_balance.policy.manifest import make_manifest
     from mjx_balance.sim.engines.mujoco import cores
     from mjx_balance.training.sizing import make_learner, size_to_device
 

@@ -30,7 +30,8 @@ with quiet_imports("torch", "warp"):
     from mjx_balance.envs.balance import BalanceEnv
     from mjx_balance.evaluation.rollout import evaluate
     from mjx_balance.evaluation.suites import HEADLINE
-    from mjx_balance.policy.file import make_manifest, save_policy
+    from mjx_balance.policy.file import save_policy
+    from mjx_balance.policy.manifest import make_manifest
     from mjx_balance.training import sizing
 
 MANTISSA = {"float32": 23, "TF32": 10, "bfloat16": 7}

@@ -17,7 +17,9 @@ import numpy as np
 
 from mjx_balance.config import Config, preset
 from mjx_balance.envs.gym import BalanceGymEnv
-from mjx_balance.policy.file import Policy, make_manifest, save_policy
+from mjx_balance.policy.file import save_policy
+from mjx_balance.policy.manifest import make_manifest
+from mjx_balance.policy.network import Policy
 
 HIDDEN = (256, 256)
 EXPLORE = 20_000

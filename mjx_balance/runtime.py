@@ -30,11 +30,18 @@ from typing import Any
 
 import numpy as np
 
-FORMAT, FORMAT_VERSION = "mjx_balance.policy", 4
+FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
+REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts it"
+ACTION = "grid"
+"""How a policy acts: it chooses a row of `actions.table_m`."""
+IMU = 6
+"""Gyro x, y and z, accelerometer x, y and z."""
 MOST_BYTES = 64 * 2**20
 """Larger files are no policies, whatever they say."""
 MOST_WHOLE = 100_000
 """Of any number of a manifest: far more than any policy has."""
+MOST_READ = 1_000_000
+"""Samples that the inputs may be means of, all together."""
 GYRO_MOST = 35.0
 """rad/s of one sample; a gyro's widest usual range is 2,000 deg/s."""
 ACCEL_MOST = 160.0
@@ -95,8 +102,8 @@ class Controller:
         path = Path(path)
         try:
             self.manifest, weights = _read(path)
-            self._set_up(self.manifest["config"]["task"], self.manifest)
-            self._network = _Network(self.manifest["network"], len(self._scale), weights)
+            self._set_up(self.manifest)
+            self._network = _Network(self.manifest["network"], self._inputs.size, weights)
             if len(self._table) != math.prod(self._network.factors):
                 raise PolicyFileError("its action table is not what its network chooses from")
         except PolicyFileError as error:
@@ -109,43 +116,36 @@ class Controller:
         self._clock = clock
         self.reset()
 
-    def _set_up(self, task: dict[str, Any], manifest: dict[str, Any]) -> None:
+    def _set_up(self, manifest: dict[str, Any]) -> None:
         """Takes what is needed of a manifest, and room for what is to be remembered."""
         self._legs = legs = _Legs(manifest["robot"])
         self.joints: list[list[str]] = [list(leg["joints"]) for leg in manifest["robot"]["legs"]]
         """Names of the abduction, hip and knee joints of every leg, in the order of `step`."""
-        self.sample_dt = _number("sim_dt", task["sim_dt"], 1e-4, 1)
+        if any(len(names) != 3 for names in self.joints):
+            raise PolicyFileError("its legs have other than three joints")
+        timing = manifest["timing"]
+        self.sample_dt = _number("sample_s", timing["sample_s"], 1e-4, 1)
         """Time between two IMU samples, s."""
-        self._decision_dt = _number("ctrl_dt", task["ctrl_dt"], self.sample_dt, 10)
-        self.decision_samples = round(self._decision_dt / self.sample_dt)
+        self.decision_samples = _whole("decision_samples", timing["decision_samples"], 1)
         """IMU samples from one decision to the next."""
+        self._decision_dt = self.decision_samples * self.sample_dt
         # From one fall to the other within a decision.
-        fall = math.radians(_number("fail_tilt", task["fail_tilt"], 0, 90))
+        fall = math.radians(_number("fail_tilt_deg", manifest["fail_tilt_deg"], 0, 90))
         self._turn_most = 2 * fall / self._decision_dt
-        share = _number("action_ramp", task["action_ramp"], 0, 1)
-        ramp_steps = max(1, round(share * self.decision_samples))
-        self._share = (np.arange(1, ramp_steps + 1) / ramp_steps)[:, None]
-        self._height = _number("body_height", task["body_height"], *legs.height_range)
+        ramp = _whole("ramp_samples", timing["ramp_samples"], 1, self.decision_samples)
+        self._share = (np.arange(1, ramp + 1) / ramp)[:, None]
+        self._height = _number("body_height_m", manifest["body_height_m"], *legs.height_range)
+        if manifest["action"] != ACTION:
+            raise PolicyFileError(
+                f"its action is {manifest['action']!r:.40}; this file runs {ACTION!r}"
+            )
         self._table = _numbers("table_m", manifest["actions"]["table_m"], (None, 2))
 
-        gyro, accel, commands = (
-            np.asarray([_whole(name, lag, 0) for lag in task[name]], int)
-            for name in ("gyro_lags", "accel_lags", "command_lags")
-        )
-        mean = _whole("imu_mean", task["imu_mean"], 1)
-        lags = np.concatenate((gyro, gyro, accel, accel))
-        self._history = int(lags.max()) + mean
+        self._inputs = inputs = _Inputs(manifest["inputs"], len(self.joints))
+        self._history = inputs.lookback("gyro", "accelerometer")
         # The history as of the last decision, then room for the samples since.
-        self._imu = np.empty((self._history + self.decision_samples, 6))
-        # Of every IMU input: the rows it is the mean of, and the channel.
-        self._rows = len(self._imu) - 1 - np.arange(mean)[:, None] - lags
-        self._channels = np.repeat((0, 1, 3, 4), (len(gyro), len(gyro), len(accel), len(accel)))
-        self._commanded = np.empty((int(commands.max(initial=0)) + 1, len(self.joints)))
-        self._command_rows = len(self._commanded) - 1 - commands
-        inputs = len(self.joints) * (1 + len(commands)) + len(lags)
-        self._scale = _numbers("scale", manifest["observation"]["scale"], (inputs,))
-        if not (self._scale > 0).all():
-            raise PolicyFileError("its scale has entries that are not above 0")
+        self._imu = np.empty((self._history + self.decision_samples, IMU))
+        self._commands = np.empty((inputs.lookback("command"), len(self.joints)))
 
         low, high = legs.limits()
         most = np.repeat((GYRO_MOST, ACCEL_MOST), 3)
@@ -164,8 +164,8 @@ class Controller:
         """Why the controller is holding, in a sentence."""
         self.action: int | None = None
         """Index of the action that was decided on last."""
-        self._commanded[:] = self._height
-        self._path = self._legs.joint_angles(self._commanded[-1:])
+        self._commands[:] = self._height
+        self._path = self._legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]
         self._since = 0
         self._called = self._decided = math.nan
@@ -212,21 +212,21 @@ class Controller:
                 f"joint_positions, gyro and accelerometer have shapes {joints.shape}, {gyro.shape} "
                 f"and {accel.shape}; they must be {self._targets.shape}, (3,) and (3,)"
             )
-        self._reading[:-6] = joints.ravel()
-        self._reading[-6:-3] = gyro
+        self._reading[:-IMU] = joints.ravel()
+        self._reading[-IMU:-3] = gyro
         self._reading[-3:] = accel
 
     def _advance(self, now: float) -> None:
         """Goes on by the sample that was taken."""
         self._check_reading()
         if self.state is State.STANDING:
-            self._imu[:] = self._reading[-6:]
+            self._imu[:] = self._reading[-IMU:]
             self._check_posture()
             self.state = State.BALANCING
             self._decide(now)
         else:
             self._check_time(now)
-            self._imu[self._history + self._since] = self._reading[-6:]
+            self._imu[self._history + self._since] = self._reading[-IMU:]
             self._since += 1
             if self._since == self.decision_samples:
                 self._check_decision(now)
@@ -286,7 +286,7 @@ class Controller:
                 f"the gyro gives {turns:.3g} rad/s about x and y in the mean of a decision, more "
                 f"than {self._turn_most:.3g}: the robot falls, or these are no rad/s"
             )
-        away = np.abs(self._reading[:-6] - self._targets.ravel())
+        away = np.abs(self._reading[:-IMU] - self._targets.ravel())
         k = int(away.argmax())
         if away[k] > AWAY_MOST:
             name = [name for leg in self.joints for name in leg][k]
@@ -297,20 +297,73 @@ class Controller:
     def _decide(self, now: float) -> None:
         """Chooses an action; the next samples find its ramp in `_path`."""
         self.action = self._network.greedy(self._observation())
-        before = self._commanded[-1].copy()
+        before = self._commands[-1].copy()
         after = self._legs.moved(before, self._table[self.action])
-        self._commanded[:-1] = self._commanded[1:]
-        self._commanded[-1] = after
+        self._commands[:-1] = self._commands[1:]
+        self._commands[-1] = after
         self._path = self._legs.joint_angles(before * (1 - self._share) + after * self._share)
         self._imu[: self._history] = self._imu[-self._history :]
         self._since, self._decided = 0, now
 
     def _observation(self) -> np.ndarray:
         """(obs_size,) the network's input."""
-        heights = self._legs.foot_heights(self._reading[:-6].reshape(-1, 3)) - self._height
-        commanded = self._commanded[self._command_rows].ravel() - self._height
-        imu = self._imu[self._rows, self._channels].mean(axis=0)
-        return np.concatenate((heights, commanded, imu)) / self._scale
+        gyro, accelerometer = np.split(self._imu, 2, axis=1)
+        return self._inputs.observe(
+            {
+                "height": self._legs.foot_heights(self._reading[:-IMU].reshape(-1, 3))[None],
+                "command": self._commands,
+                "gyro": gyro,
+                "accelerometer": accelerometer,
+            }
+        )
+
+
+class _Inputs:
+    """The network's inputs, as the rows of the manifest's `inputs` describe them.
+
+    An input is (mean of `window` samples - offset) / scale; the newest of these samples is `lag`
+    samples old.
+    """
+
+    def __init__(self, rows: list[dict[str, Any]], legs: int) -> None:
+        channels = {"height": legs, "command": legs, "gyro": 3, "accelerometer": 3}
+        self._ages = dict.fromkeys(channels, 1)
+        groups: dict[tuple[str, int], list[tuple[int, int, int]]] = {}
+        for k, row in enumerate(rows):
+            sensor = row["sensor"]
+            if sensor not in channels:
+                raise PolicyFileError(
+                    f"its inputs have the sensor {sensor!r:.40}; this file knows "
+                    f"{', '.join(channels)}"
+                )
+            index = _whole("index", row["index"], 0, channels[sensor] - 1)
+            # Heights are measured at a decision; there are none of before.
+            most = 0 if sensor == "height" else MOST_WHOLE
+            lag, window = _whole("lag", row["lag"], 0, most), _whole("window", row["window"], 1)
+            self._ages[sensor] = max(self._ages[sensor], lag + window)
+            groups.setdefault((sensor, window), []).append((k, index, lag))
+        if self._ages["height"] > 1 or sum(w * len(x) for (_, w), x in groups.items()) > MOST_READ:
+            raise PolicyFileError("its inputs are means of more samples than there are")
+        self.size = len(rows)
+        self._offset = _numbers("offset", [row["offset"] for row in rows], (self.size,))
+        self._scale = _numbers("scale", [row["scale"] for row in rows], (self.size,))
+        if not (self._scale > 0).all():
+            raise PolicyFileError("its scale has entries that are not above 0")
+        self._groups = []
+        for (sensor, window), group in groups.items():
+            places, index, lags = np.asarray(group, int).T
+            self._groups.append((sensor, places, -1 - np.arange(window)[:, None] - lags, index))
+
+    def lookback(self, *sensors: str) -> int:
+        """Samples of these sensors that are needed, the newest included."""
+        return max(self._ages[sensor] for sensor in sensors)
+
+    def observe(self, samples: dict[str, np.ndarray]) -> np.ndarray:
+        """(size,) from the samples of each sensor, (n, channels), the newest last."""
+        values = np.empty(self.size)
+        for sensor, places, steps, index in self._groups:
+            values[places] = samples[sensor][steps, index].mean(axis=0)
+        return (values - self._offset) / self._scale
 
 
 class _Legs:
@@ -418,6 +471,8 @@ class _Network:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Manifest and weights of a safetensors file: size of the header, header, numbers."""
     try:
+        if path.exists() and not path.is_file():
+            raise PolicyFileError("it cannot be read: it is no regular file")
         if path.stat().st_size > MOST_BYTES:
             raise PolicyFileError(f"it has {path.stat().st_size} bytes, and no policy so many")
         content = path.read_bytes()
@@ -442,7 +497,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise PolicyFileError("it carries no manifest of a policy of mjx_balance") from error
     if found != (FORMAT, FORMAT_VERSION):
         raise PolicyFileError(
-            f"it is {found[0]} version {found[1]}; this file runs {FORMAT} version {FORMAT_VERSION}"
+            f"it is {found[0]!s:.40} version {found[1]!s:.40}; this file runs {FORMAT} version "
+            f"{FORMAT_VERSION}{REMEDY if found == (FORMAT, FORMAT_VERSION - 1) else ''}"
         )
     return manifest, weights
 
@@ -472,10 +528,10 @@ def _number(name: str, value: Any, least: float, most: float) -> float:
     return float(value)
 
 
-def _whole(name: str, value: Any, least: int) -> int:
-    if type(value) is not int or not least <= value <= MOST_WHOLE:
+def _whole(name: str, value: Any, least: int, most: int = MOST_WHOLE) -> int:
+    if type(value) is not int or not least <= value <= most:
         raise PolicyFileError(
-            f"its {name} holds {value!r}; it must hold whole numbers from {least} to {MOST_WHOLE}"
+            f"its {name} is {value!r:.40}; it must be a whole number from {least} to {most}"
         )
     return value
 

@@ -12,7 +12,9 @@ from mjx_balance.config import Config, preset
 from mjx_balance.envs import balance as env_module
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.rollout import evaluate
-from mjx_balance.policy.file import Policy, make_manifest, save_policy
+from mjx_balance.policy.file import save_policy
+from mjx_balance.policy.manifest import make_manifest
+from mjx_balance.policy.network import Policy
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.engines.engine import Engine, Motion, PhysicsState
 from mjx_balance.sim.scene import Scene

@@ -25,13 +25,9 @@ from mjx_balance import runtime
 from mjx_balance.config import Config, to_dict
 from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out, run_suite
 from mjx_balance.evaluation.suites import make_scenarios
-from mjx_balance.policy.file import (
-    Policy,
-    load_policy,
-    make_manifest,
-    network_branches,
-    save_policy,
-)
+from mjx_balance.policy.file import load_policy, save_policy
+from mjx_balance.policy.manifest import make_manifest, network_factors
+from mjx_balance.policy.network import Policy
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.runtime import ACCEL_MOST, GYRO_MOST, Controller, PolicyFileError, State
 from mjx_balance.sim.scene import Scene
@@ -99,7 +95,7 @@ def rig() -> Rig:
 def random_layers(config: Config, inputs: int) -> dict[str, Any]:
     """Variables of a network that chooses all kinds of actions for inputs of size 1."""
     rng = np.random.default_rng(0)
-    radial, branches = config.dqn.head == "radial", network_branches(config)
+    radial, branches = config.dqn.head == "radial", network_factors(config)
     rows, columns = [inputs, *config.dqn.hidden_sizes], [*config.dqn.hidden_sizes, sum(branches)]
     if radial:
         rows[-1] += inputs
@@ -614,8 +610,12 @@ def test_a_file_beyond_every_policy_is_not_even_read(tmp_path: Path) -> None:
         (lambda w, m: w.update({"head/bias": np.zeros(7, np.float32)}), r"shape \(42,\)"),
         (lambda w, m: w["hidden_1/kernel"].fill(np.nan), "hidden_1/kernel holds .* not finite"),
         (lambda w, m: w.update({"head/bias": np.zeros(42)}), "head/bias is F64; it must be F32"),
-        (lambda w, m: m.update(version=3), "is mjx_balance.policy.file version 3; .* version 4"),
-        (lambda w, m: m.update(format="onnx"), "it is onnx version 4"),
+        (lambda w, m: m.update(version=3), r"is mjx_balance.policy version 3; .* version 5$"),
+        (
+            lambda w, m: m.update(version=4),
+            "version 5; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts it",
+        ),
+        (lambda w, m: m.update(format="onnx"), "it is onnx version 5"),
         (lambda w, m: m.clear(), "carries no manifest"),
         (lambda w, m: m.pop("robot"), "its manifest lacks 'robot'"),
         (lambda w, m: m["robot"]["legs"][1].pop("zeros"), "its manifest lacks 'zeros'"),
@@ -624,15 +624,25 @@ def test_a_file_beyond_every_policy_is_not_even_read(tmp_path: Path) -> None:
         (lambda w, m: m["robot"]["legs"][1].update(calf=-0.2), "lengths that are not above 0"),
         (lambda w, m: m["robot"]["legs"][1].update(signs=[1, 0, 1]), r"signs not \+-1"),
         (lambda w, m: m["robot"]["legs"][1].update(signs=[1, 1]), "wrong type"),
-        (lambda w, m: m["config"]["task"].update(body_height=0.6), "body_height is 0.6; it must"),
-        (lambda w, m: m["config"]["task"].update(sim_dt=0), "sim_dt is 0; it must be from"),
-        (lambda w, m: m["config"]["task"].update(ctrl_dt=math.nan), "ctrl_dt is nan"),
-        (lambda w, m: m["config"]["task"].update(ctrl_dt=0.001), "ctrl_dt is 0.001; it must be"),
-        (lambda w, m: m["config"]["task"].update(action_ramp="0.1"), "wrong type"),
-        (lambda w, m: m["config"]["task"].update(gyro_lags=[-1] * 6), "its gyro_lags holds -1"),
-        (lambda w, m: m["config"]["task"].update(imu_mean=10**9), "its imu_mean holds 1000000000"),
-        (lambda w, m: m["config"]["task"].update(gyro_lags=[0]), r"its scale is not \(24,\) sane"),
-        (lambda w, m: m["observation"]["scale"].__setitem__(3, 0.0), "not above 0"),
+        (lambda w, m: m["robot"]["legs"][1]["joints"].pop(), "other than three joints"),
+        (lambda w, m: m.update(body_height_m=0.6), "body_height_m is 0.6; it must be from"),
+        (lambda w, m: m.update(fail_tilt_deg=math.nan), "fail_tilt_deg is nan; it must be from"),
+        (lambda w, m: m.update(action="continuous"), "action is 'continuous'; this file runs"),
+        (lambda w, m: m["timing"].update(sample_s=0), "sample_s is 0; it must be from"),
+        (lambda w, m: m["timing"].update(sample_s="0.1"), "wrong type"),
+        (lambda w, m: m["timing"].update(decision_samples=2.5), "decision_samples is 2.5; it must"),
+        (lambda w, m: m["timing"].update(ramp_samples=51), "ramp_samples is 51; .* from 1 to 50"),
+        (lambda w, m: m["inputs"][3].update(sensor="sonar"), "'sonar'; this file knows height, "),
+        (lambda w, m: m["inputs"][3].update(index=4), "index is 4; .* from 0 to 3"),
+        (lambda w, m: m["inputs"][3].update(lag=1), "lag is 1; .* from 0 to 0"),
+        (lambda w, m: m["inputs"][3].update(window=2), "more samples than there are"),
+        (lambda w, m: m["inputs"][9].update(index=3), "index is 3; .* from 0 to 2"),
+        (lambda w, m: m["inputs"][9].update(lag=-1), "lag is -1; it must be a whole number"),
+        (lambda w, m: m["inputs"][9].update(window=10**9), "window is 1000000000; it must be"),
+        (lambda w, m: [r.update(window=90_000) for r in m["inputs"][4:]], "more samples than"),
+        (lambda w, m: m["inputs"][9].update(scale=0.0), "not above 0"),
+        (lambda w, m: m["inputs"][9].update(offset=math.inf), r"its offset is not \(34,\) sane"),
+        (lambda w, m: m["inputs"].pop(), "hidden_0/kernel is missing or not of"),
         (lambda w, m: m["actions"]["table_m"].pop(), "action table is not what"),
         (lambda w, m: m["actions"]["table_m"][5].pop(), "wrong type"),
         (lambda w, m: m["network"].update(factors=[21, 20]), "head/kernel is missing or not of"),
@@ -671,21 +681,19 @@ JSON = st.recursive(
     max_leaves=12,
 )
 PLACES = [
-    ("config", "task", "sim_dt"),
-    ("config", "task", "ctrl_dt"),
-    ("config", "task", "action_ramp"),
-    ("config", "task", "body_height"),
-    ("config", "task", "gyro_lags"),
-    ("config", "task", "command_lags"),
-    ("config", "task", "imu_mean"),
-    ("config", "task"),
+    *(("inputs", 7, name) for name in ("sensor", "index", "lag", "window", "offset", "scale")),
+    ("inputs", 7),
+    ("inputs",),
+    *(("timing", name) for name in ("sample_s", "decision_samples", "ramp_samples")),
+    ("timing",),
+    ("body_height_m",),
+    ("fail_tilt_deg",),
+    ("action",),
     ("network", "factors"),
     ("network", "radial"),
     ("network", "hidden_sizes"),
     ("network",),
     ("actions", "table_m"),
-    ("observation", "scale"),
-    ("observation",),
     ("robot", "legs"),
     ("robot", "foot_radius"),
     ("robot",),

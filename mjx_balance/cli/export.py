@@ -8,32 +8,46 @@ import tyro
 
 from mjx_balance.cli.common import complain
 from mjx_balance.errors import how_to_install
-from mjx_balance.policy.file import load_policy
+from mjx_balance.policy.convert import convert_policy
+from mjx_balance.policy.file import find_policy, load_policy
+from mjx_balance.policy.manifest import FORMAT_VERSION
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportArgs:
-    """Write a policy as an ONNX model. Needs the package onnx, and no JAX."""
+    """Write a policy as an ONNX model (needs the package onnx), or in today's file format."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Policy file, run folder, or the name of a shipped policy."""
     out: Path
-    """File to write, NAME.onnx."""
+    """File to write: NAME.onnx, or NAME.safetensors to convert a policy of an older format."""
 
 
 def export(argv: list[str]) -> int:
     args = tyro.cli(ExportArgs, args=argv, prog="mjx-balance export")
-    if args.out.suffix != ".onnx":
-        return complain(f"out is {args.out}; its name must end in .onnx")
+    writers = {".onnx": _write_onnx, ".safetensors": _write_safetensors}
+    if args.out.suffix not in writers:
+        return complain(f"out is {args.out}; its name must end in {' or '.join(writers)}")
+    return writers[args.out.suffix](args.policy, args.out)
+
+
+def _write_onnx(name: Path, out: Path) -> int:
     try:
         from mjx_balance.policy.onnx import OPSET, export_onnx
     except ImportError as error:
         return complain(f"export needs the package onnx ({error}); {how_to_install('onnx')}")
-    policy = load_policy(args.policy)
-    size = export_onnx(policy, args.out)
-    print(f"{args.out}: {size / 1000:,.1f} kB, opset {OPSET}")
+    policy = load_policy(name)
+    size = export_onnx(policy, out)
+    print(f"{out}: {size / 1000:,.1f} kB, opset {OPSET}")
     print(
         f"observation (N, {policy.observation_size}) float32 -> "
         f"q_values (N, {len(policy.actions)}) float32, action (N,) int64"
     )
+    return 0
+
+
+def _write_safetensors(name: Path, out: Path) -> int:
+    policy = convert_policy(find_policy(name), out)
+    size = out.stat().st_size
+    print(f"{out}: {size / 1000:,.1f} kB, format {FORMAT_VERSION}, weights {policy.fingerprint}")
     return 0

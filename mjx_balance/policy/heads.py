@@ -92,6 +92,16 @@ class Radial:
 Head = Added | Radial
 
 
+def network_factors(head: str, levels: Sequence[int]) -> tuple[int, ...]:
+    """Factors of a head over a grid of actions: all actions at once, or axis by axis.
+
+    Args:
+      head: "joint", "factored" or "radial".
+      levels: of each axis of the grid.
+    """
+    return (math.prod(levels),) if head == "joint" else tuple(levels)
+
+
 @functools.cache
 def points(factors: tuple[int, ...]) -> np.ndarray:
     """Where the radial head places the actions: (prod(factors), len(factors)), -1 to 1."""

@@ -16,15 +16,16 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from mjx_balance.files.run_folder import write_atomically
-from mjx_balance.policy.file import Policy, installed_version
 from mjx_balance.policy.heads import points
+from mjx_balance.policy.manifest import installed_version
+from mjx_balance.policy.network import Policy
 
 OPSET = 17
 IR_VERSION = 8
 """What belongs to opset 17; a higher one would shut older runtimes out for nothing."""
 ABOUT = (
-    "Greedy policy of mjx_balance. The metadata's manifest names and scales the observation's "
-    "entries; the action is a row of its actions.table_m."
+    "Greedy policy of mjx_balance. The metadata's inputs say what each entry of the observation "
+    "is, in order; the action is a row of actions.table_m in the metadata's manifest."
 )
 
 
@@ -50,8 +51,9 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
     """A policy as an ONNX model that onnx's own checker has passed.
 
     Input `observation` (N, obs_size) float32; outputs `q_values` (N, num_actions) float32 and
-    `action` (N,) int64, for any N. Its metadata holds the manifest, as JSON. Whatever the
-    observation, not finite ones included, the action is one of the policy's.
+    `action` (N,) int64, for any N. Its metadata holds `manifest` and the rows of the observation,
+    `inputs`, as JSON. Whatever the observation, not finite ones included, the action is
+    one of the policy's.
     """
     graph = _Graph()
     x = "observation"
@@ -80,7 +82,8 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
         ir_version=IR_VERSION,
         opset_imports=[helper.make_opsetid("", OPSET)],
     )
-    helper.set_model_props(model, {"manifest": json.dumps(policy.manifest)})
+    parts = {"manifest": policy.manifest, "inputs": policy.manifest["inputs"]}
+    helper.set_model_props(model, {name: json.dumps(value) for name, value in parts.items()})
     onnx.checker.check_model(model, full_check=True)
     return model
 

@@ -25,7 +25,7 @@ from mjx_balance.dqn.learner import REPLICATED, Learner
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import write_json
-from mjx_balance.policy.file import network_branches
+from mjx_balance.policy.manifest import network_factors
 from mjx_balance.sim.engines.mujoco import cores
 from mjx_balance.training.program_cache import Say, cache_dir, enable_compilation_cache
 
@@ -198,7 +198,7 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
     swept = combinations(config)[0]
     return Learner(
         env,
-        QNetwork(config.dqn.hidden_sizes, network_branches(config), config.dqn.head == "radial"),
+        QNetwork(config.dqn.hidden_sizes, network_factors(config), config.dqn.head == "radial"),
         config.dqn,
         config.num_envs,
         config.num_env_steps,

@@ -19,14 +19,9 @@ from mjx_balance.dqn.updating import Params
 from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import RunFolder
-from mjx_balance.policy.file import (
-    Policy,
-    PolicyError,
-    flat_weights,
-    load_policy,
-    make_manifest,
-    save_policy,
-)
+from mjx_balance.policy.file import flat_weights, load_policy, save_policy
+from mjx_balance.policy.manifest import PolicyError, make_manifest
+from mjx_balance.policy.network import Policy
 from mjx_balance.sim.scene import Scene
 from mjx_balance.training.loop import number
 from mjx_balance.training.program_cache import Say

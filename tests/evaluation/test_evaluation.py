@@ -31,7 +31,8 @@ from mjx_balance.evaluation.rollout import (
     summarize,
 )
 from mjx_balance.evaluation.suites import SuiteError, make_scenarios
-from mjx_balance.policy.file import PolicyError, make_manifest, save_policy
+from mjx_balance.policy.file import save_policy
+from mjx_balance.policy.manifest import PolicyError, make_manifest
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.observation import observation_names
 from mjx_balance.task.pushes import Pushes

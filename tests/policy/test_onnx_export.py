@@ -21,7 +21,9 @@ from mjx_balance.config import preset
 from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.evaluation.controllers import View
 from mjx_balance.evaluation.rollout import policy_scene, run_suite
-from mjx_balance.policy.file import Policy, flat_weights, make_manifest
+from mjx_balance.policy.file import flat_weights
+from mjx_balance.policy.manifest import make_manifest
+from mjx_balance.policy.network import Policy
 from mjx_balance.policy.onnx import IR_VERSION, OPSET, onnx_model
 
 SHIPPED = Path(__file__).parents[2] / "policies" / "best.safetensors"
@@ -138,12 +140,14 @@ def test_file_says_what_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         f"{file}: {file.stat().st_size / 1000:.1f} kB, opset 17",
         "observation (N, 136) float32 -> q_values (N, 441) float32, action (N,) int64",
     ]
-    assert file.stat().st_size < 100_000
+    assert file.stat().st_size < 140_000
     assert os.listdir(tmp_path) == ["policy.onnx"]
     policy = load_policy(SHIPPED)
     runtime = session(file.read_bytes())
     meta = runtime.get_modelmeta()
-    assert json.loads(meta.custom_metadata_map["manifest"]) == policy.manifest
+    manifest, inputs = (json.loads(meta.custom_metadata_map[x]) for x in ("manifest", "inputs"))
+    assert manifest == policy.manifest
+    assert [(row["name"], row["lag"]) for row in inputs][-1] == ("Acc_y,t-145", 145)
     assert meta.producer_name == "mjx_balance"
     shapes = [(x.name, x.shape, x.type) for x in (*runtime.get_inputs(), *runtime.get_outputs())]
     assert shapes == [
@@ -163,7 +167,9 @@ def test_file_says_what_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     [
         (("none.safetensors", "--out", "p.onnx"), "no policy file at none.safetensors"),
         (("text", "--out", "p.onnx"), "text is damaged or no safetensors file"),
-        ((str(SHIPPED), "--out", "p.safetensors"), "out is p.safetensors; its name must end in"),
+        ((str(SHIPPED), "--out", "p.h5"), "out is p.h5; its name must end in .onnx or .safeten"),
+        (("text", "--out", "p.safetensors"), "text is damaged or no safetensors file"),
+        ((str(SHIPPED), "--out", "no/p.safetensors"), "cannot write no/p.safetensors: No such"),
         ((str(SHIPPED), "--out", "no/p.onnx"), "cannot write no/p.onnx: No such file or directory"),
         ((str(SHIPPED), "--out", "text/p.onnx"), "cannot write text/p.onnx: Not a directory"),
         ((str(SHIPPED), "--out", "folder.onnx"), "cannot write folder.onnx: Is a directory"),

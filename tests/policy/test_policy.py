@@ -22,14 +22,9 @@ from hypothesis import strategies as st
 import mjx_balance
 from mjx_balance.config import Config, preset
 from mjx_balance.dqn.networks import QNetwork
-from mjx_balance.policy.file import (
-    Policy,
-    PolicyError,
-    find_policy,
-    load_policy,
-    make_manifest,
-    save_policy,
-)
+from mjx_balance.policy.file import find_policy, load_policy, save_policy
+from mjx_balance.policy.manifest import PolicyError, make_manifest
+from mjx_balance.policy.network import Policy
 
 HEADS = {"joint": (441,), "factored": (21, 21), "radial": (21, 21)}
 Weights = dict[str, np.ndarray]
@@ -127,9 +122,16 @@ def test_file_says_what_it_needs_to_run(path: Path) -> None:
     assert policy.observation_size == 34
     np.testing.assert_allclose(1000 * policy.actions[21 * 20 + 10], (3.0, 0.0), atol=1e-6)
     manifest = policy.manifest
-    assert manifest["observation"]["names"][4] == "V_x,t-0"
-    assert manifest["observation"]["scale"][4] == pytest.approx(0.0174533)
-    assert manifest["rates_hz"] == {"decision": 5.0, "imu": 250.0}
+    assert manifest["inputs"][4] == {
+        "name": "V_x,t-0",
+        "sensor": "gyro",
+        "index": 0,
+        "lag": 0,
+        "window": 1,
+        "offset": 0.0,
+        "scale": pytest.approx(0.0174533),
+        "mirror": {"row": "V_x,t-0", "sign": -1},
+    }
     assert manifest["scene_hash"] == "0123456789abcdef"
     assert manifest["training"] == {"seed": 5}
     assert manifest["versions"]["mujoco"]
@@ -138,11 +140,13 @@ def test_file_says_what_it_needs_to_run(path: Path) -> None:
 def test_manifest_gives_times_and_offsets_of_the_preset_best() -> None:
     """Means over 5 samples of 4 ms, legs that move for the first 10% of 0.2 s."""
     manifest = make_manifest(preset("best"), "0" * 16, {})
-    observation = manifest["observation"]
-    assert observation["imu_mean_samples"] == 5
-    assert (observation["imu_lag_s"], observation["height_offset_m"]) == (0.004, 0.35)
-    assert len(observation["names"]) == len(observation["scale"]) == 136
-    assert manifest["actions"]["ramp_s"] == pytest.approx(0.02)
+    assert len(manifest["inputs"]) == 136
+    assert [manifest["inputs"][k]["window"] for k in (0, 5, 16, 135)] == [1, 1, 5, 5]
+    assert [manifest["inputs"][k]["offset"] for k in (0, 5, 16, 135)] == [0.35, 0.35, 0, 0]
+    timing = {"sample_s": 0.004, "decision_samples": 50, "ramp_samples": 5}
+    assert manifest["timing"] == timing
+    assert (manifest["body_height_m"], manifest["fail_tilt_deg"]) == (0.35, 6.0)
+    assert manifest["action"] == "grid"
     assert manifest["network"] == {"hidden_sizes": [64, 64], "factors": [21, 21], "radial": True}
     assert [leg["name"] for leg in manifest["robot"]["legs"]] == ["LF", "RF", "LH", "RH"]
 
@@ -223,10 +227,10 @@ def test_weights_without_a_manifest_are_refused(path: Path) -> None:
             "weight head/kernel .* not finite",
         ),
         (lambda w, m: w.pop("head/kernel"), "weight head/kernel is missing"),
-        (lambda w, m: m.update(version=99), "version is 99; this release reads 4"),
+        (lambda w, m: m.update(version=99), "version is 99; this release reads 5$"),
         (
-            lambda w, m: m.update(version=3),
-            "version is 3; this release reads 4, and policies/upgrade.py",
+            lambda w, m: m.update(version=4),
+            "version is 4; this release reads 5; `mjx-balance export OLD.safetensors --out NEW",
         ),
         (lambda w, m: m.update(format="onnx"), "format is 'onnx'"),
         (lambda w, m: m.pop("scene_hash"), "scene_hash is None; it must be a string"),
@@ -247,10 +251,10 @@ def test_weights_without_a_manifest_are_refused(path: Path) -> None:
         ),
         (lambda w, m: m["robot"]["legs"][1]["signs"].pop(), "signs must have 3 entries"),
         (lambda w, m: m["robot"]["legs"][1].update(left=1), "left must be bool"),
-        (lambda w, m: m["robot"]["legs"][1].update(name="RM"), "its observation is not what"),
-        (lambda w, m: m["observation"]["names"].reverse(), "its observation is not what"),
+        (lambda w, m: m["robot"]["legs"][1].update(name="RM"), "its inputs is not what"),
+        (lambda w, m: m["inputs"].reverse(), "its inputs is not what"),
         (lambda w, m: m["network"].update(radial=True), "its network is not what"),
-        (lambda w, m: m["rates_hz"].update(decision=50.0), "its rates_hz is not what"),
+        (lambda w, m: m["timing"].update(ramp_samples=50), "its timing is not what"),
         (lambda w, m: m["config"].update(wings=2), "unknown field 'wings'"),
         (lambda w, m: m["config"]["task"].update(ctrl_dt=0.0), r"ctrl_dt is 0\.0"),
         (lambda w, m: m["actions"]["table_m"].pop(), "its actions is not what its own config"),

@@ -21,7 +21,9 @@ import pytest
 from mjx_balance.cli import main
 from mjx_balance.config import Config, preset, to_dict
 from mjx_balance.evaluation.rollout import Envelope
-from mjx_balance.policy.file import Policy, load_policy, make_manifest, save_policy
+from mjx_balance.policy.file import load_policy, save_policy
+from mjx_balance.policy.manifest import make_manifest
+from mjx_balance.policy.network import Policy
 from mjx_balance.render.drawing import RenderError
 from mjx_balance.report import figures, measuring, page, reading
 from mjx_balance.report.measuring import Measured

@@ -21,7 +21,8 @@ from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.suites import SEEDS
 from mjx_balance.files.run_folder import RunFolder
-from mjx_balance.policy.file import make_manifest, save_policy
+from mjx_balance.policy.file import save_policy
+from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.sim.scene import Scene
 from mjx_balance.training import finish, loop
 from mjx_balance.training.loop import Interrupts

@@ -1,0 +1,129 @@
+"""The manifest of a policy: everything that is needed to run it elsewhere, as JSON values.
+
+`inputs` are the rows of the observation, from which a runtime builds the network's input without
+knowing the config. All parts but `scene_hash`, `versions` and `training` follow from `config` and
+`robot`.
+"""
+
+import importlib.metadata
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_balance.config import ACTION_AXES, Config, ConfigError, check, from_dict, shown, to_dict
+from mjx_balance.errors import InputError
+from mjx_balance.policy import heads
+from mjx_balance.robots.catalogue import Robot, find_robot, robot_from_dict
+from mjx_balance.task.actions import action_table
+from mjx_balance.task.observation import input_rows
+
+FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
+CONVERTIBLE = 4
+"""Older version that `convert.py` reads."""
+REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts a file of version 4"
+VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
+"""Packages whose versions a manifest records."""
+
+
+class PolicyError(InputError):
+    """A policy file that cannot be used; the message says what is wrong with it."""
+
+
+def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) -> dict[str, Any]:
+    """Describes a policy.
+
+    Args:
+      config: what it was trained with.
+      scene_hash: fingerprint of the scene it was trained in.
+      training: provenance, e.g. decisions and seconds.
+
+    Returns:
+      JSON values.
+    """
+    return {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "config": to_dict(config),
+        **describe(config, find_robot(config.robot)),
+        "scene_hash": scene_hash,
+        "versions": {package: installed_version(package) for package in VERSIONED},
+        "training": dict(training),
+    }
+
+
+def describe(config: Config, robot: Robot) -> dict[str, Any]:
+    """The parts of a manifest that follow from config and robot, for a runtime to read."""
+    task = config.task
+    return {
+        "robot": to_dict(robot),
+        "inputs": [
+            row._asdict() | {"mirror": row.mirror._asdict()} for row in input_rows(task, robot)
+        ],
+        "network": {
+            "hidden_sizes": list(config.dqn.hidden_sizes),
+            "factors": list(network_factors(config)),
+            "radial": config.dqn.head == "radial",
+        },
+        "action": "grid",
+        "actions": {"table_m": action_table(task).tolist()},
+        "timing": {
+            "sample_s": task.sim_dt,
+            "decision_samples": task.sim_steps,
+            "ramp_samples": task.ramp_steps,
+        },
+        "body_height_m": task.body_height,
+        "fail_tilt_deg": task.fail_tilt,
+    }
+
+
+def network_factors(config: Config) -> tuple[int, ...]:
+    """Factors of the config's Q-network (`heads.network_factors`)."""
+    return heads.network_factors(config.dqn.head, (config.task.action_levels,) * ACTION_AXES)
+
+
+def read_manifest(manifest: Any) -> tuple[Config, Robot]:
+    """Config and robot of a manifest, all of whose other parts follow from them.
+
+    Raises:
+      PolicyError: for another format, a config that cannot be run, or a part that differs.
+    """
+    if not isinstance(manifest, dict):
+        raise PolicyError("its manifest is not a JSON object")
+    for name, expected in (("format", FORMAT), ("version", FORMAT_VERSION)):
+        value = manifest.get(name)
+        if value != expected:
+            remedy = REMEDY if value == CONVERTIBLE else ""
+            raise PolicyError(f"{name} is {shown(value)}; this release reads {expected!r}{remedy}")
+    config, robot = config_and_robot(manifest)
+    for part, expected in describe(config, robot).items():
+        if manifest.get(part) != expected:
+            raise PolicyError(f"its {part} is not what its own config gives")
+    return config, robot
+
+
+def config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
+    """Config and robot of a manifest of this format or the one before.
+
+    Raises:
+      PolicyError: if one of them, or another part, is not of its type, or cannot be run.
+    """
+    kinds = {"config": dict, "robot": dict, "scene_hash": str, "versions": dict, "training": dict}
+    for name, kind in kinds.items():
+        if not isinstance(manifest.get(name), kind):
+            right = {dict: "a JSON object", str: "a string"}[kind]
+            raise PolicyError(f"its {name} is {shown(manifest.get(name))}; it must be {right}")
+    try:
+        robot = robot_from_dict(manifest["robot"])
+    except ValueError as error:
+        raise PolicyError(f"its robot cannot be used: {error}") from error
+    try:
+        return check(from_dict(Config, manifest["config"]), robot), robot
+    except ConfigError as error:
+        raise PolicyError(f"its config cannot be used: {error}") from error
+
+
+def installed_version(package: str) -> str | None:
+    """Version of an installed package; None for one that is not."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

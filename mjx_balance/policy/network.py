@@ -1,0 +1,115 @@
+"""The Q-network of an exported policy in NumPy."""
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mjx_balance.config import shown
+from mjx_balance.policy import heads
+from mjx_balance.policy.manifest import PolicyError, network_factors, read_manifest
+from mjx_balance.task.actions import action_table
+
+
+class Policy:
+    """A greedy policy in NumPy.
+
+    Calling it maps observations to action indices. `.manifest` is the file's JSON,
+    `.config` the config it was trained with, `.robot` the robot, `.actions` the
+    (num_actions, 2) height changes in m that the indices stand for, `.layers` the kernels
+    and biases.
+    """
+
+    def __init__(self, manifest: dict[str, Any], weights: Mapping[str, np.ndarray]):
+        """Takes what a policy file holds.
+
+        Args:
+          manifest: from `make_manifest`, or a file's.
+          weights: float32 arrays by the names of `flat_weights`.
+
+        Raises:
+          PolicyError: if manifest and weights do not fit together.
+        """
+        self.config, self.robot = read_manifest(manifest)
+        self.manifest = manifest
+        self.scene_hash: str = manifest["scene_hash"]
+        self.actions = action_table(self.config.task)
+        self.factors = network_factors(self.config)
+        self.radial = self.config.dqn.head == "radial"
+        self.observation_size = len(manifest["inputs"])
+        hidden = self.config.dqn.hidden_sizes
+        names = [f"hidden_{i}" for i in range(len(hidden))] + ["head"]
+        rows = [self.observation_size, *hidden]
+        columns = [*hidden, sum(self.factors)]
+        shapes: dict[str, tuple[int, ...]] = {}
+        if self.radial:
+            rows[-1] += self.observation_size
+            columns[-1] = 1 + len(self.factors)
+            shapes |= {"profile": (4,), "stretch": (len(self.factors),)}
+        for name, n, m in zip(names, rows, columns, strict=True):
+            shapes |= {f"{name}/kernel": (n, m), f"{name}/bias": (m,)}
+        _check_weights(weights, shapes)
+        self.layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
+        if self.radial:
+            self.profile, self.stretch = weights["profile"], weights["stretch"]
+
+    @property
+    def fingerprint(self) -> str:
+        """Short digest of the weights."""
+        arrays = [array for layer in self.layers for array in layer]
+        if self.radial:  # as they enter the head
+            arrays += [np.logaddexp(0, self.profile), np.exp(self.stretch)]
+        return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
+
+    def q_values(self, obs: np.ndarray) -> np.ndarray:
+        """Action values.
+
+        Args:
+          obs: (obs_size,) or (batch, obs_size) scaled observations.
+
+        Returns:
+          (num_actions,) or (batch, num_actions) float32.
+
+        Raises:
+          ValueError: if obs has another size.
+        """
+        return self._head(obs).q_values()
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        """Index of the best action: () for (obs_size,), (batch,) for (batch, obs_size)."""
+        return self._head(obs).argmax()
+
+    def _head(self, obs: np.ndarray) -> heads.Head:
+        obs = x = np.asarray(obs, np.float32)
+        if x.ndim not in (1, 2) or x.shape[-1] != self.observation_size:
+            raise ValueError(
+                f"obs has shape {x.shape}; it must be ({self.observation_size},) or "
+                f"(batch, {self.observation_size})"
+            )
+        for kernel, bias in self.layers[:-1]:
+            x = np.maximum(x @ kernel + bias, 0.0)
+        kernel, bias = self.layers[-1]
+        if not self.radial:
+            return heads.Added(x @ kernel + bias, self.factors)
+        out = np.concatenate((x, obs), axis=-1) @ kernel + bias
+        return heads.Radial(out, self.profile, self.stretch, self.factors)
+
+
+def _check_weights(
+    weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]
+) -> None:
+    extra = sorted(set(weights) - set(shapes))
+    if extra:
+        raise PolicyError(f"weight {shown(extra[0])} is none of this network's")
+    for name, shape in shapes.items():
+        if name not in weights:
+            raise PolicyError(f"weight {name} is missing")
+        value = weights[name]
+        if value.shape != shape or value.dtype != np.float32:
+            raise PolicyError(
+                f"weight {name} is {value.dtype} of shape {value.shape}; it must be float32 of "
+                f"shape {shape}"
+            )
+        if not np.isfinite(value).all():
+            raise PolicyError(f"weight {name} holds values that are not finite numbers")

@@ -1,0 +1,114 @@
+"""Policies of format 4 become format 5; their weights stay bit for bit."""
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+
+from mjx_balance import load_policy
+from mjx_balance.cli import main
+from mjx_balance.policy.file import PolicyError
+
+BEST = Path(__file__).parents[2] / "policies" / "best.safetensors"
+BEST_WEIGHTS = "c3065c4ac7291b85110c51b25d00b20788154305de85ab5f24f3710c30ca8915"
+"""SHA-256 of all bytes behind the header of `best`, when it was of format 4."""
+
+
+def weights_digest(path: Path) -> str:
+    """SHA-256 of what follows a safetensors file's header."""
+    content = path.read_bytes()
+    return hashlib.sha256(content[8 + int.from_bytes(content[:8], "little") :]).hexdigest()
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """The shipped policy as release 0.3 wrote it: names and scales instead of rows."""
+    with safetensors.safe_open(BEST, framework="numpy") as file:
+        manifest: dict[str, Any] = json.loads(file.metadata()["manifest"])
+    rows = manifest.pop("inputs")
+    for part in ("action", "timing", "body_height_m", "fail_tilt_deg"):
+        del manifest[part]
+    manifest["version"] = 4
+    manifest["observation"] = {
+        "names": [row["name"] for row in rows],
+        "scale": [row["scale"] for row in rows],
+        "height_offset_m": 0.35,
+        "imu_lag_s": 0.004,
+        "imu_mean_samples": 5,
+    }
+    manifest["actions"]["ramp_s"] = 0.02
+    manifest["rates_hz"] = {"decision": 5.0, "imu": 250.0}
+    path = tmp_path / "old.safetensors"
+    weights = safetensors.numpy.load_file(BEST)
+    safetensors.numpy.save_file(weights, path, metadata={"manifest": json.dumps(manifest)})
+    return path
+
+
+def test_the_shipped_policy_has_the_weights_that_it_had() -> None:
+    assert weights_digest(BEST) == BEST_WEIGHTS
+
+
+def test_an_old_policy_is_refused_with_the_command_that_converts_it(
+    old: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    message = (
+        f"{old} cannot be used: version is 4; this release reads 5; "
+        "`mjx-balance export OLD.safetensors --out NEW.safetensors` converts a file of version 4"
+    )
+    with pytest.raises(PolicyError) as caught:
+        load_policy(old)
+    assert str(caught.value) == message
+    assert main(["evaluate", str(old)]) == 2
+    assert capsys.readouterr().err == f"mjx-balance: {message}\n"
+
+
+@pytest.mark.parametrize("name", ["new.safetensors", "old.safetensors"])
+def test_converting_leaves_the_weights_alone(
+    old: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Into another file, and in place; what comes out is what is shipped, byte for byte."""
+    out = old.parent / name
+    assert main(["export", str(old), "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"{out}: 106.5 kB, format 5, weights 98d9936b5446f8c1\n"
+    assert weights_digest(out) == BEST_WEIGHTS
+    policy, shipped = load_policy(out), load_policy(BEST)
+    assert policy.manifest == shipped.manifest
+    obs = np.random.default_rng(0).normal(size=(100, 136))
+    np.testing.assert_array_equal(policy.q_values(obs), shipped.q_values(obs))
+
+
+def test_a_policy_of_todays_format_is_copied(tmp_path: Path) -> None:
+    out = tmp_path / "copy.safetensors"
+    assert main(["export", "best", "--out", str(out)]) == 0
+    assert out.read_bytes() == BEST.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("version", 3, "version is 3; this release reads 5"),
+        ("config", {"wings": 2}, "its config cannot be used: unknown field 'wings'"),
+        ("robot", {}, "its robot cannot be used"),
+        ("scene_hash", None, "its scene_hash is None; it must be a string"),
+        ("training", [], r"its training is \[\]; it must be a JSON object"),
+    ],
+)
+def test_what_is_no_policy_is_not_converted(
+    old: Path, part: str, value: Any, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with safetensors.safe_open(old, framework="numpy") as file:
+        manifest = json.loads(file.metadata()["manifest"]) | {part: value}
+    weights = safetensors.numpy.load_file(old)
+    safetensors.numpy.save_file(weights, old, metadata={"manifest": json.dumps(manifest)})
+    out = old.parent / "new.safetensors"
+    assert main(["export", str(old), "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"mjx-balance: {old} cannot be used: ")
+    assert re.search(message, said)
+    assert not out.exists()
