@@ -77,6 +77,20 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("scratch") / "p.safetensors"
 
 
+def test_the_fingerprint_is_of_every_array_of_the_weights(tmp_path: Path) -> None:
+    """A change anywhere, a bias or the head's profile included, gives another; a note does not."""
+    path = written(tmp_path / "p", "radial")
+    names, prints = safetensors.numpy.load_file(path), [load_policy(path).fingerprint]
+    for name in names:
+        written(path, "radial")
+        rewrite(path, lambda weights, _: weights.update({name: weights[name] + 0.125}))  # noqa: B023
+        prints.append(load_policy(path).fingerprint)
+    assert len(set(prints)) == len(names) + 1
+    written(path, "radial")
+    rewrite(path, lambda _, manifest: manifest.update(training={"note": "another"}))
+    assert load_policy(path).fingerprint == prints[0]
+
+
 def test_radial_values_by_hand(tmp_path: Path) -> None:
     """Q = V + alpha exp(-beta z) - kappa z, z = sqrt(delta^2 + |k (x - mu)|^2), in plain Python."""
     path = written(tmp_path / "p", "radial")

@@ -605,6 +605,16 @@ def test_torques_of_unusual_motors(kind: str, tmp_path: Path) -> None:
     assert (robot.hip_torque, robot.knee_torque) == pytest.approx((23.7, 45.4), rel=1e-5)
 
 
+def test_the_weakest_motor_of_a_kind_counts(tmp_path: Path) -> None:
+    """An abduction has 20 N m, one knee 30: no leg is told to do more."""
+    spec = bodies.our_spec()
+    for name, torque in (("RH_abduction", 20.0), ("LF_knee", 30.0)):
+        [servo] = [x for x in spec.actuators if x.target == name]
+        servo.forcerange = [-torque, torque]
+    robot = find_robot(written(tmp_path, spec))
+    assert (robot.hip_torque, robot.knee_torque) == (20.0, 30.0)
+
+
 def test_a_strong_robot_can_be_read_back(tmp_path: Path) -> None:
     """A policy carries its numbers; one of 300 kg on narrow legs has servos of 10,100 N m/rad."""
     name = edited(tmp_path, [], servo_stiffness="10100", knee_torque="20000")
