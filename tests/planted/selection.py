@@ -88,20 +88,20 @@ def distances(file: str) -> dict[str, int]:
 
 
 def tests_of(module: str) -> list[list[str]]:
-    """Test files that import a module, in groups: the nearest first.
+    """Test files that import a module, directly or not, in groups: the nearest first.
 
-    A group is of one distance. Within it, tests of the folder that mirrors the module's come
-    first, then those that import the least.
+    A group is of one distance; tests of the folder that mirrors the module's are all in the first.
+    Within a group, a file of the module's name comes first, then those that import the least.
     """
+    room = Path("tests", *modules()[module].parts[1:-1])
     reached: dict[int, list[str]] = {}
     for file in graph():
-        name = Path(file).name
-        if name.startswith("test_") and module in (steps := distances(file)):
-            reached.setdefault(steps[module], []).append(file)
+        if Path(file).name.startswith("test_") and module in (steps := distances(file)):
+            near = Path(file).parent == room != Path("tests")
+            reached.setdefault(1 if near else steps[module], []).append(file)
 
     def rank(file: str) -> tuple[bool, bool, int]:
-        room = Path(*modules()[module].parts[1:]).parent
         alike = Path(file).stem.removeprefix("test_") == module.rpartition(".")[2]
-        return not alike, Path(file).parent != Path("tests") / room, len(graph()[file])
+        return not alike, Path(file).parent != room, len(graph()[file])
 
     return [sorted(files, key=rank) for _, files in sorted(reached.items())]

@@ -615,6 +615,33 @@ def test_the_weakest_motor_of_a_kind_counts(tmp_path: Path) -> None:
     assert (robot.hip_torque, robot.knee_torque) == (20.0, 30.0)
 
 
+def test_unequal_legs_count_by_their_mean(tmp_path: Path) -> None:
+    """Hind shanks of 180 mm: 0.77 of 0.426 and 0.393 m and the foot; servos by (l h / y)^2."""
+    spec = bodies.our_spec()
+    for leg in ("LH", "RH"):
+        spec.geom(f"{leg}_foot").pos = [0, 0, -0.18]
+    robot = find_robot(written(tmp_path, spec))
+    height = round(0.022 + 0.77 * (0.426 + 0.393) / 2, 3)
+    assert robot.body_height == height
+    softer = (0.4095 * height / (0.426 * 0.35)) ** 2
+    found = (robot.servo_stiffness, robot.servo_damping, robot.servo_armature)
+    assert found == pytest.approx((400 * softer, 16 * softer, 0.02 * softer), rel=3e-3)
+
+
+@pytest.mark.parametrize(("limits", "end"), [((-2.72, -1.5), 1), ((-1.4, -0.3), 0)])
+def test_a_height_leaves_room_for_the_board(
+    tmp_path: Path, limits: tuple[float, float], end: int
+) -> None:
+    """Knees that stay bent or straight: 7 deg below the longest legs, or above the shortest."""
+    spec = bodies.our_spec()
+    for leg in bodies.LEGS:
+        spec.joint(f"{leg}_knee").range = limits
+    robot = find_robot(written(tmp_path, spec))
+    reach = 0.426 * np.cos(limits[end] / 2) + 0.022
+    room = np.tan(np.radians(7)) * (0.193 + 0.142)
+    assert robot.body_height == pytest.approx(reach - room if end else reach + room, abs=6e-4)
+
+
 def test_a_strong_robot_can_be_read_back(tmp_path: Path) -> None:
     """A policy carries its numbers; one of 300 kg on narrow legs has servos of 10,100 N m/rad."""
     name = edited(tmp_path, [], servo_stiffness="10100", knee_torque="20000")
