@@ -62,6 +62,17 @@ def test_a_target_that_changes_on_the_way(scene: Scene) -> None:
     assert roll[-1] == pytest.approx(0, abs=0.05)
 
 
+def test_the_caption_has_the_boards_roll_before_its_pitch(scene: Scene) -> None:
+    one = session(scene)
+    for key in (RIGHT, RIGHT, DOWN):
+        one.press(key)
+    for _ in range(5):
+        one.decide()
+    tilt, board, falls = one.caption()[1].splitlines()
+    assert (board, falls) == ("+2.0, +1.0 deg", "0")
+    assert tilt == f"{one.tilt:.2f} deg"
+
+
 def test_a_kick_moves_the_robot_once(scene: Scene) -> None:
     one, other = session(scene), session(scene)
     one.press(KICK_KEY)
