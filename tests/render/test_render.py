@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import Config
-from mjx_balance.render.drawing import PICTURE_SIZE, VIDEO_SIZE, RenderError, Window, write
+from mjx_balance.render.drawing import (
+    PICTURE_SIZE,
+    VIDEO_SIZE,
+    RenderError,
+    Window,
+    frame_stride,
+    write,
+)
 from mjx_balance.sim.scene import Scene
 
 
@@ -31,6 +38,14 @@ def test_a_picture_shows_a_tilted_board(config: Config, scene: Scene, tmp_path: 
     assert level.shape == (PICTURE_SIZE[1], PICTURE_SIZE[0], 3)
     assert level.std() > 20
     assert np.mean(level != tilted) > 0.02
+
+
+@pytest.mark.parametrize(("sim_dt", "stride"), [(0.004, 10), (0.0027, 15), (0.003, 13), (0.1, 1)])
+def test_pictures_come_25_times_a_second_or_with_every_step(
+    config: Config, sim_dt: float, stride: int
+) -> None:
+    task = dataclasses.replace(config.task, sim_dt=sim_dt)
+    assert frame_stride(dataclasses.replace(config, task=task)) == stride
 
 
 @pytest.mark.slow
