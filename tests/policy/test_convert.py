@@ -1,19 +1,18 @@
 """Policies of format 4 become format 5; their weights stay bit for bit."""
 
 import hashlib
-import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import safetensors
-import safetensors.numpy
+from fixtures.policies import Manifest, Weights, rewrite
 
 from mjx_balance import load_policy
 from mjx_balance.cli import main
-from mjx_balance.policy.file import PolicyError
+from mjx_balance.policy.manifest import PolicyError
 
 BEST = Path(__file__).parents[2] / "policies" / "best.safetensors"
 BEST_WEIGHTS = "c3065c4ac7291b85110c51b25d00b20788154305de85ab5f24f3710c30ca8915"
@@ -29,24 +28,25 @@ def weights_digest(path: Path) -> str:
 @pytest.fixture
 def old(tmp_path: Path) -> Path:
     """The shipped policy as release 0.3 wrote it: names and scales instead of rows."""
-    with safetensors.safe_open(BEST, framework="numpy") as file:
-        manifest: dict[str, Any] = json.loads(file.metadata()["manifest"])
-    rows = manifest.pop("inputs")
-    for part in ("action", "timing", "body_height_m", "fail_tilt_deg"):
-        del manifest[part]
-    manifest["version"] = 4
-    manifest["observation"] = {
-        "names": [row["name"] for row in rows],
-        "scale": [row["scale"] for row in rows],
-        "height_offset_m": 0.35,
-        "imu_lag_s": 0.004,
-        "imu_mean_samples": 5,
-    }
-    manifest["actions"]["ramp_s"] = 0.02
-    manifest["rates_hz"] = {"decision": 5.0, "imu": 250.0}
+
+    def edit(weights: Weights, manifest: Manifest) -> None:
+        rows = manifest.pop("inputs")
+        for part in ("action", "timing", "body_height_m", "fail_tilt_deg"):
+            del manifest[part]
+        manifest["version"] = 4
+        manifest["observation"] = {
+            "names": [row["name"] for row in rows],
+            "scale": [row["scale"] for row in rows],
+            "height_offset_m": 0.35,
+            "imu_lag_s": 0.004,
+            "imu_mean_samples": 5,
+        }
+        manifest["actions"]["ramp_s"] = 0.02
+        manifest["rates_hz"] = {"decision": 5.0, "imu": 250.0}
+
     path = tmp_path / "old.safetensors"
-    weights = safetensors.numpy.load_file(BEST)
-    safetensors.numpy.save_file(weights, path, metadata={"manifest": json.dumps(manifest)})
+    shutil.copy(BEST, path)
+    rewrite(path, edit)
     return path
 
 
@@ -102,10 +102,7 @@ def test_a_policy_of_todays_format_is_copied(tmp_path: Path) -> None:
 def test_what_is_no_policy_is_not_converted(
     old: Path, part: str, value: Any, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with safetensors.safe_open(old, framework="numpy") as file:
-        manifest = json.loads(file.metadata()["manifest"]) | {part: value}
-    weights = safetensors.numpy.load_file(old)
-    safetensors.numpy.save_file(weights, old, metadata={"manifest": json.dumps(manifest)})
+    rewrite(old, lambda w, m: m.update({part: value}))
     out = old.parent / "new.safetensors"
     assert main(["export", str(old), "--out", str(out)]) == 2
     said = capsys.readouterr().err

@@ -1,6 +1,5 @@
 """The ONNX model: what NumPy computes, under onnxruntime; written whole or not at all."""
 
-import dataclasses
 import json
 import os
 import sys
@@ -8,17 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from fixtures.policies import HEADS, random_params, with_head
 
 from mjx_balance import load_policy
 from mjx_balance.cli import main
 from mjx_balance.config import preset
-from mjx_balance.dqn.networks import QNetwork
 from mjx_balance.evaluation.controllers import View
 from mjx_balance.evaluation.rollout import policy_scene, run_suite
 from mjx_balance.policy.file import flat_weights
@@ -27,7 +24,6 @@ from mjx_balance.policy.network import Policy
 from mjx_balance.policy.onnx import IR_VERSION, OPSET, onnx_model
 
 SHIPPED = Path(__file__).parents[2] / "policies" / "best.safetensors"
-HEADS = {"joint": (441,), "factored": (21, 21), "radial": (21, 21)}
 NAMES = ["shipped", *HEADS]
 
 
@@ -50,14 +46,9 @@ def make_policy(name: str) -> Policy:
     """The shipped policy, or one of the same inputs and a head whose weights are all random."""
     if name == "shipped":
         return load_policy(SHIPPED)
-    best = preset("best")
-    dqn = dataclasses.replace(best.dqn, hidden_sizes=(24, 16), head=name)
-    network = QNetwork((24, 16), HEADS[name], name == "radial")
-    shapes: Any = jax.eval_shape(network.init, jax.random.PRNGKey(0), jnp.zeros(136))
-    rng = np.random.default_rng(0)
-    params = jax.tree.map(lambda x: rng.normal(0, 0.5 / np.sqrt(x.shape[0]), x.shape), shapes)
-    manifest = make_manifest(dataclasses.replace(best, dqn=dqn), "0" * 16, {"seed": 5})
-    return Policy(manifest, flat_weights(params))
+    config = with_head(preset("best"), name)
+    manifest = make_manifest(config, "0" * 16, {"seed": 5})
+    return Policy(manifest, flat_weights(random_params(config)))
 
 
 def session(model: bytes) -> onnxruntime.InferenceSession:
