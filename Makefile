@@ -1,5 +1,6 @@
 # The two commands of the README are `make train` and `make test`; each sets up what it needs.
-# ARGS="..." passes flags through; EXTRAS=cuda installs the CUDA build of JAX.
+# ARGS="..." passes flags through; EXTRAS=cuda installs JAX for CUDA 13, EXTRAS=cuda12 for CUDA 12.
+# PYTHON=python3.13 makes the environment, VENV=.venv313 in a folder of its own.
 PYTHON ?= python3
 EXTRAS ?=
 VENV := .venv

@@ -51,6 +51,7 @@ LINKS = {
     "../benchmarks/README.md": "results.md",
     "benchmarks/README.md": "results.md",
     "docs/clusters.md": "clusters.md",
+    "docs/install.md": "install.md",
     "ARCHITECTURE.md": "architecture.md",
 }
 """Where links of the repository's files lead on the site."""

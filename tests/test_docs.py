@@ -31,6 +31,8 @@ import yaml
 from brax.training.agents.ppo import train as ppo
 
 from mjx_balance import cli, config, runtime
+from mjx_balance.cli import evaluate as evaluate_command
+from mjx_balance.cli import train as train_command
 from mjx_balance.envs import balance as env
 from mjx_balance.envs import brax as brax_training
 from mjx_balance.evaluation import rollout as evaluation
@@ -148,7 +150,7 @@ def run_make(rest: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         extras = value.split(",") if name == "EXTRAS" else []
         assert set(extras) <= set(PROJECT["optional-dependencies"]), value
     # Not what a `make test ARGS=...` around this test hands on.
-    outer = ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "ARGS", "EXTRAS", "PYTHON")
+    outer = "MAKEFLAGS MFLAGS MAKELEVEL MAKEOVERRIDES ARGS EXTRAS PYTHON VENV".split()
     own = {name: value for name, value in os.environ.items() if name not in outer}
     command = ["make", "--dry-run", "--no-print-directory", "--directory", str(REPO), *rest]
     made = subprocess.run(command, capture_output=True, text=True, env=own)
@@ -279,7 +281,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     def train(wanted: config.Config, *_: Any) -> None:
         config.check(wanted)
 
-    def filmed(scene: Any, controller: Any, args: cli.EvaluateArgs) -> int:
+    def filmed(scene: Any, controller: Any, args: evaluate_command.EvaluateArgs) -> int:
         assert args.video is not None
         args.video.write_bytes(b"")
         return 0
@@ -292,15 +294,15 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
     trainer = inspect.signature(ppo.train)
     place = types.SimpleNamespace(index=0)
-    monkeypatch.setattr(evaluation, "run_suite", few)
+    monkeypatch.setattr(evaluate_command, "run_suite", few)
     monkeypatch.setattr(evaluation, "policy_scene", found)
     monkeypatch.setattr(render, "write", drawn)
     shut = types.SimpleNamespace(is_open=False, close=lambda: None)
     monkeypatch.setattr(render, "Window", lambda *arguments: shut)
     monkeypatch.setattr(run, "train", train)
     monkeypatch.setattr(ppo, "train", train_ppo)
-    monkeypatch.setattr(cli, "read_run_config", lambda path: config.preset("default"))
-    monkeypatch.setattr(cli, "_video", filmed)
+    monkeypatch.setattr(train_command, "read_run_config", lambda path: config.preset("default"))
+    monkeypatch.setattr(evaluate_command, "_video", filmed)
     monkeypatch.setattr(processes, "find_place", lambda *where: place)
     monkeypatch.setattr(report_page, "write_report", lambda *arguments: [])
     # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.

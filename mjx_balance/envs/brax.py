@@ -7,14 +7,31 @@ to where they fell, on a board that is already tilted, and from the time limit o
 step would end an episode.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper, VmapWrapper
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from mjx_balance.envs.balance import BalanceEnv
+
+
+def _device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
+    """Copies every leaf (...) to (devices, ...), one copy per device."""
+    sharding = NamedSharding(Mesh(np.asarray(devices), ("device",)), PartitionSpec("device"))
+    return jax.tree.map(
+        lambda leaf: jax.device_put(jnp.stack([leaf] * len(devices)), sharding), tree
+    )
+
+
+# JAX 0.10 removed this function, which PPO and SAC of brax 0.14.2 call (google/brax issue 671).
+# To be deleted with the first release of brax that no longer does.
+if not hasattr(jax, "device_put_replicated"):
+    jax.device_put_replicated = _device_put_replicated
 
 
 def wrap(

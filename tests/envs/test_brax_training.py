@@ -177,6 +177,15 @@ def test_what_brax_cannot_have_is_refused(env: BalanceEnv) -> None:
         wrap(env, EPISODE, randomization_fn=lambda sys: (sys, sys))
 
 
+def test_braxs_trainers_get_a_copy_of_every_leaf_per_device() -> None:
+    """By JAX's own function or, where JAX has none any more, by ours."""
+    devices = jax.local_devices()[:2]
+    copies: Any = jax.device_put_replicated({"w": np.arange(3.0), "n": 7}, devices)
+    assert [shard.data.tolist() for shard in copies["w"].addressable_shards] == [[[0, 1, 2]]] * 2
+    assert [shard.device for shard in copies["n"].addressable_shards] == devices
+    assert copies["n"].tolist() == [7, 7]
+
+
 def test_an_evaluation_takes_height_changes_too(env: BalanceEnv) -> None:
     """Of those of the grid it makes what it makes of their indices."""
     scene, table = env.scene, action_table(env.config.task)
