@@ -1,24 +1,21 @@
-"""What each piece of a preset is worth: trains with it taken out or exchanged.
+"""What is each piece of a preset worth? Trains with it taken out or exchanged.
 
-Every variant is a run of `train` with a few flags changed, shorter than a full run, and
-keeps its folder, so that an interrupted ablation goes on where it stopped. `--write`
-puts the tables between the markers of a Markdown file.
+Every variant is a run of `train` with a few flags changed, shorter than a full run, and keeps its
+folder, so that an interrupted ablation goes on where it stopped.
 
-    python benchmarks/ablation.py --write benchmarks/README.md
+    python benchmarks/ablation.py [--preset default] [--write benchmarks/README.md]
 """
 
 import argparse
 import hashlib
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from markers import publish, table
+import common
+from common import DURATION, Row
 
 from mjx_balance.config import preset
 from mjx_balance.evaluation.suites import HEADLINE
@@ -50,8 +47,8 @@ VARIANTS = {
     "best": {
         "as it is": "",
         "all errors squared": "--huber-delta None",
-        "no kicks": "--push-max 0",
-        "no kicks, all errors squared": "--push-max 0 --huber-delta None",
+        "no pushes": "--push-max 0",
+        "no pushes, all errors squared": "--push-max 0 --huber-delta None",
         "reward for the tilt at the end": "--reward-tilt end",
         "Double DQN": "--double",
         "two decisions of samples and commands": lags(range(0, 100, 5), "0 1"),
@@ -63,68 +60,54 @@ DECISIONS = {"default": 40_000, "best": 100_000}
 SCENARIOS = {"default": 24, "best": 128}
 
 
-def result_of(
-    name: str, title: str, flags: str, seed: int, runs: Path, wanted: bool
-) -> dict[str, Any] | None:
-    """The evaluation of one run, trained if it is wanted and missing."""
-    common = (
-        f"--preset {name} --engine mujoco --num-env-steps {DECISIONS[name]} --seed {seed} "
-        f"--eval-every 0 --eval-scenarios {SCENARIOS[name]}"
-    )
-    digest = hashlib.sha256(f"{common} {flags}".encode()).hexdigest()[:8]
-    slug = "-".join(re.findall("[a-z0-9.]+", title.lower()))
-    folder = runs / f"{name}-{slug}-seed{seed}-{digest}"
+def run_result(flags: str, seed: int, args: argparse.Namespace, train: bool) -> Row | None:
+    """The evaluation of one run, trained if it is missing; none if it is missing and not asked."""
+    name = args.preset
+    flags += f" --preset {name} --engine mujoco --eval-every 0 --seed {seed}"
+    flags += f" --num-env-steps {args.decisions or DECISIONS[name]}"
+    flags += f" --eval-scenarios {args.scenarios or SCENARIOS[name]}"
+    folder = args.runs / f"{name}-{seed}-{hashlib.sha256(flags.encode()).hexdigest()[:8]}"
     result = folder / "evaluation.json"
-    if wanted and not result.is_file():
-        if folder.is_dir():  # it has the flags in its folder
-            more = ["--resume", str(folder)]
-        else:
-            more = ["--run-dir", str(folder), *common.split(), *flags.split()]
-        subprocess.run([sys.executable, "-m", "mjx_balance", "train", *more], check=True)
+    if train and not result.is_file():
+        # The folder of an interrupted run has its flags.
+        how = ["--resume", str(folder)] if folder.is_dir() else ["--run-dir", str(folder)]
+        how += [] if folder.is_dir() else flags.split()
+        subprocess.run([sys.executable, "-m", "mjx_balance", "train", *how], check=True)
     return json.loads(result.read_text()) if result.is_file() else None
 
 
-def rows_of(name: str, args: argparse.Namespace) -> list[list[str]]:
-    """Trains what is missing of a preset's variants; returns the rows that there are."""
+def variant_rows(args: argparse.Namespace) -> list[Row]:
+    """Trains what is missing; returns the variants that have a run."""
     rows = []
-    for number, (title, flags) in enumerate(VARIANTS[name].items()):
-        wanted = args.only is None or f"{name}-{number}" in args.only
-        each = [result_of(name, title, flags, seed, args.runs, wanted) for seed in args.seeds]
-        found = [result for result in each if result is not None]
-        if not found:
-            continue
-        cells = [title, str(len(found))]
-        for suite in HEADLINE:
-            tilts = [result[suite]["tilt_deg"] for result in found]
-            cells.append(str(sum(result[suite]["falls"] for result in found)))
-            cells += [f"{np.mean([tilt[key] for tilt in tilts]):.3f}" for key in ("mean", "p95")]
-            cells.append(f"{max(tilt['max'] for tilt in tilts):.3f}")
-        rows.append(cells)
+    for number, (title, flags) in enumerate(VARIANTS[args.preset].items()):
+        train = args.only is None or number in args.only
+        runs = [run_result(flags, seed, args, train) for seed in args.seeds]
+        results = [result for result in runs if result is not None]
+        if results:
+            suites = {
+                suite: common.pooled([result[suite] for result in results]) for suite in HEADLINE
+            }
+            rows.append({f"preset {args.preset}": title, "seeds": len(results), **suites})
     return rows
 
 
 def main() -> None:
-    """Trains what is missing and prints the tables."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--presets", nargs="+", default=list(VARIANTS), choices=VARIANTS)
+    """Trains what is missing and prints the table."""
+    parser = common.arguments(__doc__)
+    parser.add_argument("--preset", default="default", choices=VARIANTS)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--runs", type=Path, default=Path("runs/ablation"))
-    parser.add_argument("--only", nargs="*", help="variants to train, as default-3; none: all")
-    parser.add_argument("--write", type=Path, help="Markdown file with markers")
+    parser.add_argument("--only", type=int, nargs="*", help="rows to train, from 0; none: all")
+    parser.add_argument("--decisions", type=int, help="of each run")
+    parser.add_argument("--scenarios", type=int, help="of each evaluation and suite")
     args = parser.parse_args()
-    lines = []
-    for name in args.presets:
-        columns = [f"preset `{name}`", "seeds"]
-        for suite in HEADLINE:
-            columns += [f"`{suite}`: falls", "mean", "p95", "max"]
-        lines += [*table(columns, rows_of(name, args)), ""]
-        lines += [
-            f"{DECISIONS[name]:,} of {preset(name).num_env_steps:,} decisions, engine mujoco, "
-            f"{SCENARIOS[name]} held-out scenarios of 60 s per suite and seed, tilt in deg: means "
-            "over the seeds, their sum of falls and greatest max.",
-            "",
-        ]
-    publish("ablation", lines[:-1], args.write)
+    name = args.preset
+    note = (
+        f"{args.decisions or DECISIONS[name]:,} of {preset(name).num_env_steps:,} decisions, "
+        f"engine mujoco, {args.scenarios or SCENARIOS[name]} held-out scenarios of {DURATION:g} s "
+        f"per suite and seed; {common.TILTS}: means over the seeds, greatest max."
+    )
+    common.report(args, f"ablation {name}", variant_rows(args), note)
 
 
 if __name__ == "__main__":

@@ -1,30 +1,25 @@
 """Is the replay buffer as fast as those of others?
 
-Adds one decision of all envs and samples batches, in a jitted scan with the buffer donated, as
-in training, but on one device: `mjx_balance.dqn.replay` against flashbax's item and flat buffers
-and brax's UniformSamplingQueue, interleaved in one process. Filling: the buffer begins with one
-decision in it; full: every decision overwrites another. Compile time stands apart.
+Adds one decision of all envs and samples batches, in a jitted scan with the buffer donated, as in
+training, but on one device: `mjx_balance.dqn.replay` against flashbax's item and flat buffers and
+brax's UniformSamplingQueue. Filling: the buffer begins with one decision in it; full: every
+decision overwrites another.
 
     python benchmarks/replay.py [--rounds 7] [--json FILE] [--write benchmarks/README.md]
 """
 
-import argparse
 import functools
 import importlib.util
 import itertools
-import json
-import random
 import statistics
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
+import common
 import jax
 import jax.numpy as jnp
-from markers import publish, table
-from throughput import hardware
+from common import Row
 
 from mjx_balance.dqn import replay
 from mjx_balance.dqn.replay import Transition
@@ -32,8 +27,8 @@ from mjx_balance.quiet import quiet_imports
 
 CAPACITY, BATCH = 131_072, 512
 OBS_SIZES, NUM_ENVS = (34, 136), (256, 1024)
-SAMPLES = (32, 1)
-"""After each add; 32 as in training."""
+SAMPLES = 32
+"""After each add, as in training."""
 ADDS = 8
 """Per call."""
 MOST_ROUNDS = CAPACITY // (ADDS * max(NUM_ENVS)) - 1
@@ -122,92 +117,62 @@ def program(buffer: Buffer, make: Callable[[jax.Array], Transition], adds: int, 
     return jax.jit(run, donate_argnums=0)
 
 
-def measure(obs_size: int, num_envs: int, samples: int, rounds: int) -> list[dict[str, Any]]:
-    """Two rows: all contenders while they fill, and full."""
+def measure(obs_size: int, num_envs: int, rounds: int) -> tuple[list[Row], dict[str, float]]:
+    """Two rows, all contenders while they fill and full, in us; seconds of their compiling."""
     make = functools.partial(decision, obs_size, num_envs)
-    key = jax.random.PRNGKey(0)
-    contenders = buffers(obs_size, num_envs)
-    compiled, states, compile_s = {}, {}, {}
+    key, contenders = jax.random.PRNGKey(0), buffers(obs_size, num_envs)
+    calls, states, compile_s, rows = {}, {}, {}, []
     for name, buffer in contenders.items():
-        states[name] = buffer.init()
-        began = time.perf_counter()
-        run = program(buffer, make, ADDS, samples)
-        compiled[name] = run.lower(states[name], key).compile()
+        states[name], began = buffer.init(), time.perf_counter()
+        compiled = program(buffer, make, ADDS, SAMPLES).lower(states[name], key).compile()
         compile_s[name] = time.perf_counter() - began
-    rows = []
+
+        def call(name: str = name, compiled: Any = compiled) -> None:
+            states[name], _ = jax.block_until_ready(compiled(states[name], key))
+
+        calls[name] = call
     for phase in ("filling", "full"):
-        if phase == "full":
-            for name, buffer in contenders.items():
-                fill = program(buffer, make, CAPACITY // num_envs, 0)
-                states[name], _ = fill(states[name], key)
-        seconds: dict[str, list[float]] = {name: [] for name in compiled}
-        for k in range(1 + rounds):
-            # In any order: who comes after brax, which moves all of its rows, finds cold caches.
-            for name in random.Random(k).sample(list(compiled), len(compiled)):
-                key_k = jax.random.PRNGKey(k)
-                began = time.perf_counter()
-                states[name], _ = jax.block_until_ready(compiled[name](states[name], key_k))
-                if k:  # the first is a warm-up
-                    seconds[name].append((time.perf_counter() - began) / ADDS)
-        medians = {name: statistics.median(values) for name, values in seconds.items()}
+        for name, buffer in contenders.items() if phase == "full" else ():
+            fill = program(buffer, make, CAPACITY // num_envs, 0)
+            states[name], _ = fill(states[name], key)
+        # The first round is a warm-up. Who comes after brax, which moves all its rows, finds cold
+        # caches: the order changes.
+        seconds = {
+            name: [second / ADDS for second in those[1:]]
+            for name, those in common.interleaved(calls, 1 + rounds).items()
+        }
+        medians = {name: statistics.median(those) for name, those in seconds.items()}
         best = min(medians.keys() - {"ours"}, key=lambda name: medians[name])
-        each_round = zip(seconds[best], seconds["ours"], strict=True)
-        rows.append(
-            {
-                "obs_size": obs_size,
-                "num_envs": num_envs,
-                "samples_per_add": samples,
-                "buffer": phase,
-                "microseconds": {name: 1e6 * s for name, s in medians.items()},
-                "compile_s": compile_s,
-                "best_other": best,
-                "ours_over_best_other": statistics.median(a / b for a, b in each_round),
-            }
-        )
-    return rows
+        row = {"inputs": obs_size, "envs": num_envs, "buffer": phase}
+        row |= {name: 1e6 * median for name, median in medians.items()}
+        rows.append(row | {"ours / best other": common.ratio(seconds[best], seconds["ours"])})
+    return rows, compile_s
 
 
-def main() -> int:
+def main() -> None:
     """Measures every row and prints the table."""
-    parser = argparse.ArgumentParser()
+    parser = common.arguments(__doc__)
     parser.add_argument("--rounds", type=int, default=MOST_ROUNDS, help="at most the default")
-    parser.add_argument("--json", type=Path, help="file to write the figures to")
-    parser.add_argument("--write", type=Path, help="Markdown file with markers")
     args = parser.parse_args()
     if not 1 <= args.rounds <= MOST_ROUNDS:
-        print(f"--rounds is {args.rounds}; it must be 1 to {MOST_ROUNDS}", file=sys.stderr)
-        return 2
+        parser.error(f"--rounds is {args.rounds}; it must be 1 to {MOST_ROUNDS}")
     if importlib.util.find_spec("flashbax") is None:
-        print("flashbax is not installed: pip install -e '.[benchmarks]'", file=sys.stderr)
-        return 2
-    rows = []
-    for shape in itertools.product(OBS_SIZES, NUM_ENVS, SAMPLES):
-        print("measuring {} inputs, {} envs, {}:1 ...".format(*shape), file=sys.stderr, flush=True)
-        rows += measure(*shape, args.rounds)
-        if args.json:
-            args.json.write_text(
-                json.dumps({"hardware": hardware(), "rows": rows}, indent=2) + "\n"
-            )
-    names = list(rows[0]["microseconds"])
-    lines = [
-        [
-            *(str(row[key]) for key in ("obs_size", "num_envs", "samples_per_add", "buffer")),
-            *(f"{row['microseconds'][name]:,.0f}" for name in names),
-            f"{row['ours_over_best_other']:.2f}",
-        ]
-        for row in rows
-    ]
-    columns = ["inputs", "envs", "samples per add", "buffer", *names, "ours / best other"]
-    machine = hardware()
-    compiles = ", ".join(f"{name} {rows[0]['compile_s'][name]:.2f} s" for name in names)
+        parser.error("flashbax is not installed: pip install -e '.[benchmarks]'")
+    rows, compile_s = [], {}
+    for obs_size, num_envs in itertools.product(OBS_SIZES, NUM_ENVS):
+        common.log(f"measuring {obs_size} inputs, {num_envs} envs ...")
+        more, seconds = measure(obs_size, num_envs, args.rounds)
+        rows, compile_s = rows + more, compile_s or seconds
+    names = list(compile_s)
+    forms = {"ours / best other": "{:.2f}", **dict.fromkeys(names, "{:,.0f}")}
+    compiles = ", ".join(f"{name} {x:.2f} s" for name, x in compile_s.items())
     note = (
-        f"Microseconds for one add and its samples of {BATCH}, {CAPACITY:,} rows; ratio of rates; "
-        f"medians of {args.rounds} rounds on {machine['cpu']}, {machine['cores']} cores, "
-        f"{jax.devices()[0].device_kind}. Compiling the first row: {compiles}."
+        f"Microseconds for one add and {SAMPLES} samples of {BATCH}, {CAPACITY:,} rows; ratio of "
+        f"rates; medians of {args.rounds} rounds; {common.machine()}. Compiling the first row: "
+        f"{compiles}."
     )
-    publish("replay", [*table(columns, lines), "", note], args.write)
-    return 0
+    common.report(args, "replay", rows, note, forms)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

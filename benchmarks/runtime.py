@@ -1,14 +1,13 @@
-"""How long does the runtime for a robot take for one sample of its sensors?
+"""Is a robot's computer fast enough for the runtime?
 
 Calls `Controller.step` on one core with the noisy samples of a standing robot, one call after the
 other: 100,000 are 7 minutes of a robot's life. Where other work shares the core, the worst call is
-the scheduler's: calls in which it took the core away are counted, and the worst of the others told.
-A robot's control loop has a real-time priority; where that is allowed, it is measured too.
+the scheduler's: interrupted calls are counted, and the worst of the others given. A robot's control
+loop has a real-time priority; where that is allowed, it is measured too.
 
     python benchmarks/runtime.py [--policy policies/best.safetensors] [--write benchmarks/README.md]
 """
 
-import argparse
 import importlib.util
 import os
 import resource
@@ -17,19 +16,18 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import common
 import numpy as np
-from markers import publish, table
 
-REPO = Path(__file__).resolve().parent.parent
 # The file alone, as on a robot: beside JAX and MuJoCo a garbage collection takes longer.
-SPEC = importlib.util.spec_from_file_location("alone", REPO / "mjx_balance/runtime.py")
+SPEC = importlib.util.spec_from_file_location("alone", common.REPO / "mjx_balance/runtime.py")
 assert SPEC is not None
 assert SPEC.loader is not None
 runtime = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(runtime)
 
 
-def switches() -> int:
+def interruptions() -> int:
     """How often this thread's core has been taken away."""
     return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
 
@@ -50,10 +48,10 @@ def measure(path: Path, calls: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         if k % 1_000 == 0:
             time.sleep(0.001)  # the kernel takes the core from what never rests
         now += controller.sample_dt
-        before, began = switches(), time.perf_counter_ns()
+        before, began = interruptions(), time.perf_counter_ns()
         controller.step(joints, gyro[k], accel[k])
         took[k] = (time.perf_counter_ns() - began) / 1e6
-        interrupted[k] = switches() != before
+        interrupted[k] = interruptions() != before
     if controller.state is not runtime.State.BALANCING:
         raise RuntimeError(controller.reason)
     return took, np.arange(calls) % controller.decision_samples == 0, interrupted
@@ -61,10 +59,9 @@ def measure(path: Path, calls: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def main() -> None:
     """Measures and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
-    parser.add_argument("--policy", type=Path, default=REPO / "policies/best.safetensors")
+    parser = common.arguments(__doc__)
+    parser.add_argument("--policy", type=Path, default=common.POLICY)
     parser.add_argument("--calls", type=int, default=100_000)
-    parser.add_argument("--write", type=Path, help="Markdown file with markers")
     args = parser.parse_args()
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     rows = []
@@ -75,23 +72,21 @@ def main() -> None:
             except PermissionError:
                 continue
         took, decided, interrupted = measure(args.policy, args.calls)
-        cells = [
-            f"{np.median(took):.4f}",
-            f"{np.median(took[decided]):.3f}",
-            f"{np.percentile(took, 99.9):.3f}",
-            f"{took.max():.2f}",
-            f"{interrupted.sum()}",
-            f"{took[~interrupted].max():.2f}",
-        ]
-        rows.append([priority, *cells])
+        row = {
+            "priority": priority,
+            "median": float(np.median(took)),
+            "of a decision": float(np.median(took[decided])),
+            "99.9%": float(np.percentile(took, 99.9)),
+            "worst": float(took.max()),
+            "calls interrupted": int(interrupted.sum()),
+            "worst of the others": float(took[~interrupted].max()),
+        }
+        rows.append(row)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    columns = ["priority", "median", "of a decision", "99.9%", "worst"]
-    columns += ["calls interrupted", "worst of the others"]
-    from throughput import hardware  # only now: it loads JAX
-
-    machine = hardware()
-    note = f"ms; `{args.policy.name}`, {args.calls:,} calls on one core of {machine['cpu']}."
-    publish("runtime", [*table(columns, rows), "", note], args.write)
+    forms = {"median": "{:.4f}", "of a decision": "{:.3f}", "99.9%": "{:.3f}"}
+    forms |= {"worst": "{:.2f}", "worst of the others": "{:.2f}"}
+    note = f"ms; `{args.policy.name}`, {args.calls:,} calls on one core of {common.machine()}."
+    common.report(args, "runtime", rows, note, forms)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,17 @@
 """How soon does a robot balance?
 
-Every contender is a fresh process. Its clock runs from its start, imports and compiling
-included, to its exported policy, which then has to show what it can do, off the clock: mean tilt
-and falls in the headline suites, held-out scenarios of 60 s, plain MuJoCo. Ours are
-`train.py --preset quick --engine ENGINE`, cold (no program in the cache) and warm (the same again).
-The peer is stable-baselines3's DQN on one env of the same task (`sb3_dqn.py`): it stands still
-while its checkpoints are judged, and its time is that of the first with a mean of at most
-`--threshold` deg in suite `paper` and no fall.
+Every contender is a fresh process. Its clock runs from its start, imports and compiling included,
+to its exported policy, which is then evaluated off the clock: held-out scenarios of 60 s, plain
+MuJoCo. Ours are `train.py --preset quick --engine ENGINE`, cold (no program in the cache) and warm
+(the same again). Peers (`peers.py`) stand still while their checkpoints are evaluated; their time
+is that of the first with a mean tilt of at most `--threshold` deg in suite `paper` and no fall.
 
     python benchmarks/time_to_balance.py [--contenders mujoco mjx sb3] [--json FILE]
 """
 
 import argparse
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -20,72 +19,62 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from markers import publish, table
-from rich.console import Console
-from throughput import hardware
+import common
+from common import DURATION, REPO, Row
 
 from mjx_balance.config import preset
-from mjx_balance.evaluation import rollout as evaluation
-from mjx_balance.evaluation.suites import HEADLINE, SEEDS
-from mjx_balance.files.run_folder import RunFolder, write_json
+from mjx_balance.evaluation.suites import HEADLINE
+from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.policy.file import load_policy
-from mjx_balance.report.progress import Display
 
-HERE = Path(__file__).resolve().parent
 ENGINES = ("mujoco", "mjx")
-PRESET = preset("quick")
-PEER = "sb3"
-SCENARIOS, DURATION = 64, 60.0
-POLL = 0.02
-"""Seconds between two looks for a policy."""
+PEERS = {"sb3": "stable_baselines3", "ppo": "brax", "sac": "brax"}
+"""Contender -> the package that it needs."""
+PEERS_SCRIPT = REPO / "benchmarks" / "peers.py"
+POLL_S = 0.02
 INTERRUPTED = 130
 
 
-class Failed(Exception):
+class ContenderError(Exception):
     """A contender that ended without a policy; the message says which and how."""
 
 
-def judged(policy: Path, suite: str, display: Display) -> dict[str, Any]:
-    """`mean` tilt in deg and `falls` of a policy file in a suite."""
-    with display.bar(f"judging, suite {suite}") as bar:
-        result = evaluation.evaluate(
-            load_policy(policy), suite, SCENARIOS, DURATION, SEEDS.held_out, bar
-        )
-    return {"mean": result["tilt_deg"]["mean"], "falls": result["falls"]}
-
-
-def ours(engine: str, decisions: int, work: Path, display: Display) -> Iterator[dict[str, Any]]:
+def train_rows(engine: str, args: argparse.Namespace, work: Path) -> Iterator[Row]:
     """Two rows, cold and warm, of `train.py` with one engine."""
     for start in ("cold", "warm"):
-        display.say(f"{engine}, {start}:")
+        common.log(f"{engine}, {start}:")
         folder = RunFolder(work / f"{engine}-{start}")
-        flags = f"--preset {PRESET.preset} --engine {engine} --num-env-steps {decisions}".split()
-        flags += ["--run-dir", str(folder.path)]
-        command = [sys.executable, str(HERE.parent / "train.py"), *flags]
+        flags = f"--preset quick --engine {engine} --num-env-steps {args.decisions} --run-dir"
+        command = [sys.executable, str(REPO / "train.py"), *flags.split(), str(folder.path)]
         seconds = time_to_file(command, folder.policy, work / f"cache-{engine}")
-        training = load_policy(folder.policy).manifest["training"]
-        yield {
-            "contender": engine,
-            "engine": engine,
-            "start": start,
-            "seconds": seconds,
-            "decisions": training["env_steps"],
-            **{suite: judged(folder.policy, suite, display) for suite in HEADLINE},
-        }
+        policy = load_policy(folder.policy)
+        results = common.evaluated_policies([policy], args.scenarios)
+        decisions = policy.manifest["training"]["env_steps"]
+        yield make_row(engine, engine, start, seconds, decisions, results)
+
+
+def make_row(
+    contender: str, engine: str, start: str, seconds: float | None, decisions: int, results: Row
+) -> Row:
+    """One row; `seconds` is none if no policy was good enough."""
+    return {
+        "contender": contender,
+        "engine": engine,
+        "start": start,
+        "seconds": seconds,
+        "decisions": decisions,
+        **{s: {name: results[s][name] for name in ("mean", "falls")} for s in HEADLINE},
+    }
 
 
 def time_to_file(command: list[str], file: Path, cache: Path) -> float:
     """Seconds from the start of a process until it has written a file; then it is stopped.
 
-    Args:
-      command: of the process; what it prints goes to our standard error.
-      file: that it moves into place whole.
-      cache: folder for its compiled programs.
+    It has to move the file into place whole.
 
     Raises:
-      Failed: if it ends without the file.
+      ContenderError: if it ends without the file.
     """
     began = time.perf_counter()
     process = subprocess.Popen(
@@ -94,150 +83,112 @@ def time_to_file(command: list[str], file: Path, cache: Path) -> float:
     try:
         while not file.is_file():
             if process.poll() is not None:
-                raise Failed(f"{' '.join(command)} gave no policy, exit code {process.returncode}")
-            time.sleep(POLL)
+                code = process.returncode
+                raise ContenderError(f"{' '.join(command)} gave no policy, exit code {code}")
+            time.sleep(POLL_S)
         return time.perf_counter() - began
     finally:
         process.kill()
         process.wait()
 
 
-def peer(
-    decisions: int, every: int, threshold: float, work: Path, display: Display
-) -> dict[str, Any]:
-    """The row of stable-baselines3; `seconds` is none if no checkpoint passed.
-
-    Args:
-      decisions: to give up after.
-      every: decisions between two checkpoints.
-      threshold: greatest mean tilt in suite `paper` that passes, deg.
-      work: folder for the checkpoints.
-      display: shows progress.
+def peer_row(name: str, args: argparse.Namespace) -> Row:
+    """The row of a peer.
 
     Raises:
-      Failed: if the process ends before it has made its decisions.
+      ContenderError: if the process fails.
     """
-    flags = ["--decisions", str(decisions), "--every", str(every)]
-    command = [sys.executable, str(HERE / "sb3_dqn.py"), str(work), *flags]
-    display.say(f"{PEER}:")
-    made, seconds, passed = 0, 0.0, False
-    paper: dict[str, Any] = {}
+    flags = ["--decisions", args.most, "--every", args.every, "--scenarios", args.scenarios]
+    command = [sys.executable, str(PEERS_SCRIPT), name, *map(str, flags)]
+    common.log(f"{name}:")
+    decisions, seconds, passed, results = 0, 0.0, False, {}
     began = time.perf_counter()
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-    )
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
     assert process.stdout is not None
     try:
-        for line in process.stdout:
+        while not passed and (line := process.stdout.readline()):
             seconds += time.perf_counter() - began
-            made = int(line)
-            paper = judged(work / f"{made}.safetensors", "paper", display)
-            display.say(
-                f"{made:>9,}/{decisions:,} decisions  {seconds:.0f} s  "
-                f"mean tilt {paper['mean']:.3f} deg  falls {paper['falls']}"
-            )
-            passed = paper["mean"] <= threshold and not paper["falls"]
-            if passed or made + every > decisions:
-                break
-            began = time.perf_counter()
-            process.stdin.write("\n")
-        else:
-            raise Failed(f"{' '.join(command)} ended after {made} decisions")
+            decisions, results = int(line), json.loads(process.stdout.readline())
+            mean, falls = results["paper"]["mean"], results["paper"]["falls"]
+            common.log(f"{decisions:>9,} decisions  {seconds:.0f} s  {mean:.3f} deg  {falls} fall")
+            passed = mean <= args.threshold and not falls
+            if not passed:
+                began = time.perf_counter()
+                print(file=process.stdin, flush=True)
+        if not passed and (process.wait() or not results):
+            raise ContenderError(f"{' '.join(command)} ended after {decisions} decisions")
     finally:
         process.kill()
         process.communicate()
-    return {
-        "contender": PEER,
-        "engine": "mujoco",
-        "start": "cold",
-        "seconds": seconds if passed else None,
-        "decisions": made,
-        "paper": paper,
-        "corner": judged(work / f"{made}.safetensors", "corner", display),
-    }
+    return make_row(name, "mujoco", "cold", seconds if passed else None, decisions, results)
 
 
-def lines_of(rows: list[dict[str, Any]], threshold: float, machine: dict[str, Any]) -> list[str]:
-    """The table, and what it needs to be read."""
-    peers = [row["seconds"] for row in rows if row["contender"] == PEER]
-    reference = peers[0] if peers else None
-    cells = []
-    for row in rows:
-        seconds = row["seconds"]
-        ratio = f"{reference / seconds:.1f}" if reference and seconds else "-"
-        cells.append(
-            [
-                f"`{row['contender']}`",
-                row["start"],
-                "not reached" if seconds is None else f"{seconds:.1f}",
-                f"{row['decisions']:,}",
-                *(f"{row[suite]['mean']:.3f} ({row[suite]['falls']})" for suite in HEADLINE),
-                ratio,
-            ]
-        )
-    suites = [f"`{suite}`, deg (falls)" for suite in HEADLINE]
-    columns = ["contender", "start", "seconds", "decisions", *suites, f"`{PEER}` / this"]
+def table_lines(rows: list[Row], scenarios: int, threshold: float) -> list[str]:
+    """The table, and what a reader has to know of it."""
+    sb3 = next((row["seconds"] for row in rows if row["contender"] == "sb3"), None)
+
+    cells = [
+        {
+            "contender": row["contender"],
+            "start": row["start"],
+            "seconds": f"{row['seconds']:.1f}" if row["seconds"] else "not reached",
+            "decisions": f"{row['decisions']:,}",
+            **{suite: row[suite] for suite in HEADLINE},
+            "sb3 / this": f"{sb3 / row['seconds']:.1f}" if sb3 and row["seconds"] else "-",
+        }
+        for row in rows
+    ]
     note = (
-        f"{SCENARIOS} held-out scenarios of {DURATION:g} s per suite; `{PEER}`: first checkpoint "
-        f"with a mean of at most {threshold:g} deg in `paper` and no fall; {machine['cpu']}, "
-        f"{machine['cores']} cores."
+        f"{scenarios} held-out scenarios of {DURATION:g} s per suite, mean tilt in deg; peers: "
+        f"first checkpoint with at most {threshold:g} in `paper` and no fall; {common.machine()}."
     )
-    return [*table(columns, cells), "", note]
+    return [*common.table(cells), "", note]
 
 
 def main() -> int:
     """Runs the contenders and prints the table; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
-    names = (*ENGINES, PEER)
-    parser.add_argument("--contenders", nargs="+", default=names, choices=names)
-    wanted = PRESET.num_env_steps
-    parser.add_argument("--decisions", type=int, default=wanted, help="of our trainings")
-    parser.add_argument("--threshold", type=float, default=0.20, help=f"that {PEER} reaches, deg")
-    parser.add_argument("--most", type=int, default=200_000, help=f"decisions of {PEER} at most")
+    parser = common.arguments(__doc__)
+    names, quick = (*ENGINES, *PEERS), preset("quick").num_env_steps
+    parser.add_argument("--contenders", nargs="+", default=[*ENGINES, "sb3"], choices=names)
+    parser.add_argument("--decisions", type=int, default=quick, help="of our trainings")
+    parser.add_argument("--threshold", type=float, default=0.20, help="that peers reach, deg")
+    parser.add_argument("--most", type=int, default=200_000, help="decisions of a peer at most")
     parser.add_argument("--every", type=int, default=5_000, help="decisions between checkpoints")
-    parser.add_argument("--json", type=Path, help="file to write the figures to, row by row")
-    parser.add_argument("--write", type=Path, help="Markdown file with markers")
+    parser.add_argument("--scenarios", type=int, default=64, help="of each suite")
     args = parser.parse_args()
-    if PEER in args.contenders and importlib.util.find_spec("stable_baselines3") is None:
-        return complain(
-            f"contender {PEER} needs stable-baselines3, which is not installed; "
-            "pip install -e '.[benchmarks]', or choose others with --contenders mujoco mjx"
-        )
+    for name in args.contenders:
+        if name in PEERS and importlib.util.find_spec(PEERS[name]) is None:
+            return complain(
+                f"contender {name} needs {PEERS[name]}, which is not installed; "
+                "pip install -e '.[benchmarks]', or choose others with --contenders mujoco mjx"
+            )
     if not 1 <= args.every <= args.most:
         return complain(f"--every is {args.every}; it must be 1 to --most, {args.most}")
     if args.json and not args.json.absolute().parent.is_dir():
         return complain(f"cannot write {args.json}: its folder does not exist")
-    display, machine, code = Display(Console(stderr=True)), hardware(), 0
-    rows: list[dict[str, Any]] = []
-
-    def keep(row: dict[str, Any]) -> None:
-        rows.append(row)
-        if args.json:
-            write_json(args.json, {"hardware": machine, "threshold": args.threshold, "rows": rows})
-
-    with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder)
+    rows: list[Row] = []
+    code = 0
+    with tempfile.TemporaryDirectory() as work:
         try:
             for name in dict.fromkeys(args.contenders):
-                if name == PEER:
-                    keep(peer(args.most, args.every, args.threshold, work, display))
-                    continue
-                for row in ours(name, args.decisions, work, display):
-                    keep(row)
-        except (Failed, OSError) as failure:
-            code = complain(str(failure))
+                peer = name in PEERS
+                for row in [peer_row(name, args)] if peer else train_rows(name, args, Path(work)):
+                    rows.append(row)
+                    common.save(args.json, rows, threshold=args.threshold)
+        except (ContenderError, OSError) as error:
+            code = complain(str(error))
         except KeyboardInterrupt:
             code = INTERRUPTED
     if rows:  # an unfinished table is shown, and kept out of the page
-        lines = lines_of(rows, args.threshold, machine)
-        publish("time_to_balance", lines, None if code else args.write)
+        lines = table_lines(rows, args.scenarios, args.threshold)
+        common.publish("time_to_balance", lines, None if code else args.write)
     return code
 
 
 def complain(message: str) -> int:
     """Says what is wrong in a sentence; returns the exit code."""
-    print(f"time_to_balance: {message}", file=sys.stderr)
+    common.log(f"time_to_balance: {message}")
     return 2
 
 

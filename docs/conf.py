@@ -52,6 +52,10 @@ LINKS = {
     "benchmarks/README.md": "results.md",
     "docs/clusters.md": "clusters.md",
     "docs/install.md": "install.md",
+    "../docs/clusters.md": "clusters.md",
+    "../docs/other_algorithms.md": "other_algorithms.md",
+    "../docs/results.md": "results.md",
+    "../docs/robots.md": "robots.md",
     "ARCHITECTURE.md": "architecture.md",
 }
 """Where links of the repository's files lead on the site."""

@@ -117,7 +117,7 @@ class AttitudePD:
 
         Args:
           scene: task and addresses.
-          proportional: share of the tilt undone by one decision (benchmarks/baselines.py).
+          proportional: share of the tilt undone by one decision (benchmarks/limits.py).
           rate: time for which the present rate is undone beforehand, s (same).
         """
         self.scene, self.task = scene, scene.config.task

@@ -27,7 +27,7 @@ LIFTING, STANDING, ENVS = 2, 2, 4
 ACTIONS = jnp.concatenate((jnp.tile(LEFT_UP, (LIFTING, 1)), jnp.zeros((STANDING, 2))))
 DECISIONS = {"ppo": 60_000, "sac": 20_000}
 SCORE = {"ppo": 0.6, "sac": 0.3}
-"""Mean tilt, deg, in either suite; `benchmarks/README.md` says what it comes to."""
+"""Mean tilt, deg, in either suite; `docs/other_algorithms.md` says what it comes to."""
 
 
 def short(randomization: RandomizationConfig | None = None) -> Config:

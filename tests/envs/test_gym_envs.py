@@ -34,7 +34,7 @@ from mjx_balance.render.drawing import RenderError
 ENV = "mjx_balance/Balance-v0"
 STAND, LEFT_UP = 220, 20 * 21 + 10
 SCORE = {"dqn": 0.4, "ppo": 0.15}
-"""Mean tilt, deg, that learning has to get below; `benchmarks/README.md` says what it comes to."""
+"""Mean tilt, deg, that learning has to get below; `docs/other_algorithms.md` has the results."""
 EXAMPLE = Path(__file__).parents[2] / "examples" / "train_sb3.py"
 RANDOM = RandomizationConfig(
     payload=5.0, friction_min=0.5, gain_spread=0.2, latency_share=0.5, push_max=0.2, push_period=2.0
