@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjx_balance.cli import main
+from mjx_balance.cli import evaluate, main
+from mjx_balance.cli.common import load_controller
 from mjx_balance.config import ConfigError, preset, to_dict
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.controllers import make_controller
@@ -18,6 +19,7 @@ from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked
 from mjx_balance.policy.file import PolicyError, load_policy
 from mjx_balance.render.drawing import VIDEO_SIZE
+from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.scene import load_scene, scene_dir
 from mjx_balance.training import run
 from mjx_balance.training.checkpoints import CheckpointError
@@ -264,6 +266,36 @@ def test_evaluate_writes_figures_and_a_video(
     assert np.abs(frames[-1] - frames[0]).mean() > 0.1, "the board moves"
 
 
+def test_an_evaluation_is_of_what_was_asked_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """256 scenarios of 60 s of suite paper, or what the flags say; the video has the same seed."""
+    asked: list[Any] = []
+
+    def run_suite(scene: Any, controller: Any, *given: Any, record: bool = False) -> Any:
+        asked.append((*given[:4], record))
+        return simulate(scene, controller, given[0], 1, 0.2, 0, record=record)
+
+    simulate = evaluate.run_suite
+    monkeypatch.setattr(evaluate, "run_suite", run_suite)
+    monkeypatch.setattr("mjx_balance.render.drawing.write", lambda *given: None)
+    assert main(["evaluate", "--controller", "none"]) == 0
+    flags = "--suite push --scenarios 3 --duration 5 --seed 7 --video v.mp4"
+    assert main(["evaluate", "--controller", "none", *flags.split()]) == 0
+    assert asked == [
+        ("paper", 256, 60.0, 0, False),
+        ("push", 3, 5.0, 7, False),
+        ("push", 1, 5.0, 7, True),
+    ]
+
+
+def test_a_baseline_stands_on_the_robot_asked_for_as_high_as_it_should() -> None:
+    for name in (None, "b2"):
+        scene, _ = load_controller(None, "none", name)
+        robot = find_robot(name or "quadruped")
+        assert (scene.robot, scene.config.task.body_height) == (robot, robot.body_height)
+
+
 @pytest.mark.parametrize("flag", ["-h", "--help"])
 @pytest.mark.parametrize("command", [(), ("robot",), ("robot", "check"), ("sweep",), ("view",)])
 def test_help_is_no_error(
@@ -424,6 +456,18 @@ def test_view_shows_a_policy_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "falls" in window.said[0][0][1]
     assert "arrows: tilt the board" in window.said[0][1][1]
     assert window.closed
+
+
+def test_view_shows_the_scenario_of_a_suite_and_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    windows: list[StubWindow] = []
+    opened = lambda *given: windows.append(StubWindow(*given)) or windows[-1]  # noqa: E731
+    monkeypatch.setattr("mjx_balance.render.drawing.Window", opened)
+    assert main("view --controller none --suite corner --seed 3".split()) == 0
+    scene, controller = load_controller(None, "none", None)
+    rollout = run_suite(scene, controller, "corner", 1, 0.6, 3, record=True)
+    assert rollout.qpos is not None
+    np.testing.assert_allclose(np.concatenate(windows[0].shown), rollout.qpos[0], atol=1e-9)
+    assert {texts[1][1] for texts in windows[0].said} == {"Enter: kick"}
 
 
 @pytest.mark.parametrize(
