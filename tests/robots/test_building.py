@@ -278,6 +278,17 @@ def test_the_board_grows_with_the_robot() -> None:
     np.testing.assert_allclose(heavy.inertia, 5.493 * 1.702**2 * light.inertia, rtol=1e-6)
     stiff, soft = (x.model.actuator("board/board_x") for x in (scene, ours))
     assert stiff.gainprm[0] == pytest.approx(5.493 * 1.702**2 * soft.gainprm[0])
+    for field in ("dof_damping", "dof_armature"):
+        large, small = (
+            [
+                getattr(x.model, field)[x.model.joint(f"board/board_{axis}").dofadr[0]]
+                for axis in "xy"
+            ]
+            for x in (scene, ours)
+        )
+        assert large == pytest.approx([5.493 * 1.702**2 * value for value in small])
+    far, near = (load_scene(x.config, visual=True).model.camera("main") for x in (scene, ours))
+    np.testing.assert_allclose(far.pos, 1.702 * near.pos, rtol=1e-6)
 
 
 def test_the_boards_size_can_be_said(tmp_path: Path) -> None:

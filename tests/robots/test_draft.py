@@ -4,6 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -12,7 +13,7 @@ import pytest
 from fixtures import bodies
 
 from mjx_balance.config import check, fitted, preset
-from mjx_balance.robots.build import build, model_path
+from mjx_balance.robots.build import build, model_path, scene_dir
 from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, shipped
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.schema import parse_robot_file
@@ -78,9 +79,10 @@ def test_names_do_not_matter(tmp_path: Path, robot: Robot) -> None:
     assert found.foot_radius == 0.022
 
 
-def test_feet_that_are_no_spheres(tmp_path: Path, robot: Robot) -> None:
-    """Legs that end in a capsule: the foot is put at its tip."""
-    spec = bodies.our_spec()
+@pytest.mark.parametrize("draw", [lambda spec: spec, bodies.drawn_standing])
+def test_feet_that_are_no_spheres(draw: Any, tmp_path: Path, robot: Robot) -> None:
+    """Legs that end in a capsule: the foot is put at its tip, however the calf is turned."""
+    spec = draw(bodies.our_spec())
     for leg in bodies.LEGS:
         for geom in [g for g in spec.geoms if g.name in (f"{leg}_foot", f"{leg}_rubber")]:
             spec.delete(geom)
@@ -89,9 +91,20 @@ def test_feet_that_are_no_spheres(tmp_path: Path, robot: Robot) -> None:
             type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.01, 0, 0], fromto=[0, 0, -0.1, 0, 0, -0.225]
         )
     text, found = drafted(spec, tmp_path)
-    assert 'foot = { body = "LF_calf", offset = [0, 0, -0.215] }' in text
+    foot = parse_robot_file(text, tmp_path / "drafted.toml").legs[0].foot
+    assert foot.name == "LF_calf"
+    assert foot.offset == pytest.approx((0, 0, -0.215), abs=1e-9)
     assert "foot_radius = 0.02" in text
     assert found.legs[0].calf == pytest.approx(0.215, abs=1e-6)
+
+
+def test_the_heaviest_free_body_is_the_trunk(tmp_path: Path) -> None:
+    """And not a ball that lies about, though it comes first in the file."""
+    text = (scene_dir() / "quadruped.xml").read_text()
+    inertial = '<inertial pos="0 0 0" mass="0.3" diaginertia="0.001 0.001 0.001"/>'
+    ball = f'<body name="ball"><freejoint/>{inertial}</body>'
+    (tmp_path / "model.xml").write_text(text.replace("<worldbody>", f"<worldbody>{ball}", 1))
+    assert '\ntrunk = "trunk"\n' in draft("model.xml", tmp_path / "model.xml")
 
 
 def test_one_that_looks_along_y(tmp_path: Path, robot: Robot) -> None:
