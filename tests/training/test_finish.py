@@ -17,6 +17,7 @@ from mjx_balance.config import ConfigError, preset
 from mjx_balance.evaluation.suites import SEEDS
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.policy.file import Policy, PolicyError
+from mjx_balance.report import figures, measuring
 from mjx_balance.report.progress import Display
 from mjx_balance.training import finish
 
@@ -203,6 +204,22 @@ def test_a_diverged_seed_is_never_chosen(
     folder.evaluation.unlink()
     finished(1.0, np.nan)  # the only one left needs no rival
     assert json.loads(folder.seeds_summary.read_text())["best"] == SEED
+
+
+def test_figures_are_of_the_metrics_and_of_the_scenario_kept_for_them(
+    folder: RunFolder, export: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """100 s of suite paper, drawn by a seed that nothing else uses."""
+    [policy], _ = export(1.0)
+    folder.metrics.write_text('{"env_steps": 1}\n{"env_steps": 2}\n')
+    drawn: list[Any] = []
+    monkeypatch.setattr(measuring, "recorded", lambda policy, *given: (policy.fingerprint, *given))
+    monkeypatch.setattr(figures, "draw_figures", lambda *given: drawn.append(given))
+    monkeypatch.setattr(finish.evaluation, "policy_scene", lambda policy: policy.scene_hash)
+    finish._draw(folder)
+    rollouts = {"policy": (policy.fingerprint, "paper", 100.0, 2_000_000)}
+    lines = [{"env_steps": 1}, {"env_steps": 2}]
+    assert drawn == [(folder.figures, lines, CONFIG.task, "hash", rollouts)]
 
 
 def test_a_run_killed_while_it_finishes_finishes_again(
