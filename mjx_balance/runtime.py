@@ -10,9 +10,12 @@ This file needs nothing else of the package: copy it to the robot, beside a poli
 The targets are pure kinematics. A servo that sags under the robot's weight needs its trim added
 to them, as the simulation adds `scene.stance.leg_trim`; a servo with an integral term does not.
 
-What cannot be true, or is no balancing any more, makes the controller hold: the legs stay where
-they were last told to be, until `reset`, before which the robot must be back at its standing
-height. A loop that stops altogether is for the servos' own watchdog to notice.
+The controller holds when a reading cannot be true, or when the robot does not balance any more:
+the targets stay what they are until `reset`. Before `reset` the robot must be back at its standing
+height. The servos need a watchdog of their own for a loop that stops altogether.
+
+The policy file's manifest describes the network's inputs row by row (`inputs`); this file follows
+the rows and knows no config.
 
 Python 3.8 or newer.
 """
@@ -47,11 +50,11 @@ GYRO_MOST = 35.0
 ACCEL_MOST = 160.0
 """m/s^2 of one sample; an accelerometer's usual range is 16 g."""
 WEIGHT = (0.5 * 9.81, 1.5 * 9.81)
-"""m/s^2, least and most, that the mean of a decision's samples may have; kicked, 9.2 to 11."""
+"""m/s^2, least and most mean of a decision's samples; pushes give 9.2 to 11."""
 LEAN_MOST = 40.0
-"""deg by which that mean may lean. 6 deg are a fall, but a kick looks like a lean of up to 29."""
+"""deg by which that mean may lean. 6 deg are a fall, but a push looks like a lean of up to 29."""
 AWAY_MOST = 0.5
-"""rad by which a joint may be off what it was told, at a decision. Kicked, it is 0.03."""
+"""rad by which a joint may be off its target at a decision; pushes give 0.03."""
 KNEE_SLACK = 0.1
 """rad by which a knee may read beyond its stops."""
 LATE_SAMPLES = 5
@@ -72,29 +75,29 @@ class State(str, enum.Enum):
     BALANCING = "balancing"
     """Deciding, sample after sample."""
     HOLDING = "holding"
-    """The legs stay where they were last told to be, until `reset`."""
+    """The targets stay what they are, until `reset`."""
 
 
 class _Unsafe(Exception):
-    """What makes a controller hold, in a sentence."""
+    """The reason to hold, in a sentence."""
 
 
 class Controller:
-    """A policy at work, from one sample of the sensors to the next.
+    """Runs a policy, from one sample of the sensors to the next.
 
-    The first sample stands for all before it: the robot has been standing still. Decisions are
-    taken at the first and then every `decision_samples` samples; in between the legs follow their
-    ramp. What a decision sees and tells is what it saw and told in training.
+    The first sample stands for all before it: the robot has been standing still. The controller
+    decides at the first sample and then every `decision_samples` samples; in between the legs
+    follow their ramp. Observations and targets equal those of training.
     """
 
     def __init__(
         self, path: str | os.PathLike[str], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Reads a policy file, and stands.
+        """Reads a policy file; the controller is then standing.
 
         Args:
           path: of the policy file.
-          clock: tells the time of a call, s; in a simulation, the simulation's.
+          clock: returns the time of a call, s; in a simulation, the simulation's.
 
         Raises:
           PolicyFileError: if the file is missing, damaged, or no policy this file can run.
@@ -117,7 +120,7 @@ class Controller:
         self.reset()
 
     def _set_up(self, manifest: dict[str, Any]) -> None:
-        """Takes what is needed of a manifest, and room for what is to be remembered."""
+        """Reads the manifest, and makes room for the histories."""
         self._legs = legs = _Legs(manifest["robot"])
         self.joints: list[list[str]] = [list(leg["joints"]) for leg in manifest["robot"]["legs"]]
         """Names of the abduction, hip and knee joints of every leg, in the order of `step`."""
@@ -154,7 +157,7 @@ class Controller:
 
     @property
     def targets(self) -> np.ndarray:
-        """(legs, 3) rad that `step` returned last; before, those of the robot that stands."""
+        """(legs, 3) rad that `step` returned last; before that, the standing robot's."""
         return self._targets.copy()
 
     def reset(self) -> None:
@@ -163,7 +166,7 @@ class Controller:
         self.reason = ""
         """Why the controller is holding, in a sentence."""
         self.action: int | None = None
-        """Index of the action that was decided on last."""
+        """Index of the latest action."""
         self._commands[:] = self._height
         self._path = self._legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]
@@ -171,19 +174,19 @@ class Controller:
         self._called = self._decided = math.nan
 
     def hold(self, reason: str) -> None:
-        """Keeps the legs where they were last told to be, until `reset`."""
+        """Keeps the targets as they are, until `reset`."""
         if self.state is not State.HOLDING:
             self.state, self.reason = State.HOLDING, reason
 
     def step(
         self, joint_positions: np.ndarray, gyro: np.ndarray, accelerometer: np.ndarray
     ) -> np.ndarray:
-        """Takes a sample of the sensors, and says where the joints shall be until the next.
+        """Takes a sample of the sensors; returns the joint targets until the next sample.
 
-        It holds if a sensor reads what none can, if the IMU repeats itself, if a call comes too
-        late, or if samples come at another rate than in training. Decision by decision it also
-        holds if the robot leans, turns or weighs what none does that balances, or if a joint is far
-        from its target.
+        It holds if a reading is outside a sensor's range, if the IMU repeats itself, if a call
+        comes too late, or if samples come at another rate than in training. At a decision it also
+        holds if lean, angular rate or weight are not those of a balancing robot, or if a joint is
+        far from its target.
 
         Args:
           joint_positions: (legs, 3) abduction, hip and knee angles, rad, in the order of `joints`.
@@ -217,7 +220,7 @@ class Controller:
         self._reading[-3:] = accel
 
     def _advance(self, now: float) -> None:
-        """Goes on by the sample that was taken."""
+        """Uses the latest sample: checks, decides if a decision is due, moves the targets on."""
         self._check_reading()
         if self.state is State.STANDING:
             self._imu[:] = self._reading[-IMU:]
@@ -256,7 +259,7 @@ class Controller:
             )
 
     def _check_decision(self, now: float) -> None:
-        """Holds the samples since the last decision against the rate and against each other."""
+        """Compares the samples since the last decision with the rate and with each other."""
         took, most = now - self._decided, LATE_SAMPLES * self.sample_dt
         if abs(took - self._decision_dt) > most:
             raise _Unsafe(
@@ -267,7 +270,7 @@ class Controller:
             raise _Unsafe(f"the IMU gave the same sample {self.decision_samples + 1} times")
 
     def _check_posture(self) -> None:
-        """Holds the samples since the last decision, and the joints, against one that balances."""
+        """Compares samples since the last decision, and joints, with a balancing robot's."""
         turn, pull = np.split(self._imu[self._history :].mean(axis=0), 2)
         weight, turns = float(np.linalg.norm(pull)), float(np.linalg.norm(turn[:2]))
         if not WEIGHT[0] <= weight <= WEIGHT[1]:
@@ -295,7 +298,7 @@ class Controller:
             )
 
     def _decide(self, now: float) -> None:
-        """Chooses an action; the next samples find its ramp in `_path`."""
+        """Chooses an action and lays its ramp out in `_path`."""
         self.action = self._network.greedy(self._observation())
         before = self._commands[-1].copy()
         after = self._legs.moved(before, self._table[self.action])
@@ -492,13 +495,14 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise PolicyFileError(f"it is damaged or no safetensors file: {error}") from error
     try:
         manifest = json.loads(metadata["manifest"])
-        found = manifest["format"], manifest["version"]
+        kind, version = manifest["format"], manifest["version"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise PolicyFileError("it carries no manifest of a policy of mjx_balance") from error
-    if found != (FORMAT, FORMAT_VERSION):
+    if (kind, version) != (FORMAT, FORMAT_VERSION):
+        remedy = REMEDY if (kind, version) == (FORMAT, FORMAT_VERSION - 1) else ""
         raise PolicyFileError(
-            f"it is {found[0]!s:.40} version {found[1]!s:.40}; this file runs {FORMAT} version "
-            f"{FORMAT_VERSION}{REMEDY if found == (FORMAT, FORMAT_VERSION - 1) else ''}"
+            f"it is {kind!s:.40} version {version!s:.40}; this file runs {FORMAT} version "
+            f"{FORMAT_VERSION}{remedy}"
         )
     return manifest, weights
 

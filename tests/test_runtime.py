@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 from fixtures.policies import (
@@ -30,8 +29,7 @@ from hypothesis import strategies as st
 
 from mjx_balance import runtime
 from mjx_balance.config import Config, to_dict
-from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out, run_suite
-from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
 from mjx_balance.policy.file import load_policy, save_policy
 from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.robots.catalogue import Robot, find_robot
@@ -178,34 +176,6 @@ def test_it_does_what_the_evaluation_does_step_by_step(
         expected = expected[: len(targets)]
         np.testing.assert_allclose(targets, expected, rtol=0, atol=ANGLES_AGREE)
         assert len(targets) > (decisions - 2) * samples
-
-
-@pytest.mark.parametrize("name", ["best", "default"])
-def test_in_its_own_loop_it_walks_the_same_path(
-    name: str, paths: dict[str, Path], scenes: dict[str, Scene]
-) -> None:
-    """One robot in plain MuJoCo, 10 s of `corner`: the evaluation's positions at every step.
-
-    Rounding grows on the way, by contacts, to 3e-14 m and rad here.
-    """
-    scene, task = scenes[name], scenes[name].config.task
-    boards, _ = make_scenarios(scene.config, "corner", 1, 10.0, 3)
-    made = roll_out(scene, observing(load_policy(paths[name])), boards, 10.0, record=True)
-    assert made.qpos is not None
-    data = mujoco.MjData(scene.model)
-    data.qpos, data.qvel = scene.stance.qpos, scene.stance.qvel
-    data.qacc_warmstart = scene.stance.qacc_warmstart
-    data.sensordata[scene.imu] = scene.stance.imu
-    controller = Controller(paths[name], lambda: data.time)
-    steps = made.qpos.shape[1]
-    board = tilt.board_angle(task, boards, task.sim_dt * np.arange(1.0, steps + 1))[0]
-    for k in range(steps):
-        gyro, accel = np.split(data.sensordata[scene.imu], 2)
-        targets = controller.step(data.qpos[scene.leg_qpos], gyro, accel)
-        data.ctrl[scene.leg_ctrl] = targets + scene.stance.leg_trim
-        data.ctrl[scene.board_ctrl] = np.radians(board[k])
-        mujoco.mj_step(scene.model, data)
-        np.testing.assert_allclose(data.qpos, made.qpos[0, k], rtol=0, atol=1e-9)
 
 
 LAYOUTS: dict[str, tuple[str, dict[str, Any]]] = {

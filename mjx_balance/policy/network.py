@@ -22,7 +22,7 @@ class Policy:
     """
 
     def __init__(self, manifest: dict[str, Any], weights: Mapping[str, np.ndarray]):
-        """Takes what a policy file holds.
+        """Checks manifest and weights of a policy file.
 
         Args:
           manifest: from `make_manifest`, or a file's.

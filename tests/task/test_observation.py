@@ -4,7 +4,6 @@ import dataclasses
 import types
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -159,13 +158,3 @@ def test_history_keeps_the_newest_samples_in_order(xp: types.ModuleType, count: 
     stream = np.stack((readable_history(16 + count), -readable_history(16 + count)))
     got = extend_history(xp.asarray(stream[:, :16]), xp.asarray(stream[:, 16:]))
     np.testing.assert_array_equal(got, stream[:, -16:])
-
-
-def test_numpy_and_jax_agree_on_a_batch(robot: Robot) -> None:
-    rng = np.random.default_rng(0)
-    task = TaskConfig(command_lags=(1,), imu_mean=2)
-    signals = rng.normal(size=(3, 1, 4)), rng.normal(size=(3, 2, 4)), rng.normal(size=(3, 17, 6))
-    ours = observed(task, robot, *signals)
-    np.testing.assert_allclose(observed(task, robot, *map(jnp.asarray, signals)), ours, rtol=1e-4)
-    one_by_one = [observed(task, robot, *(x[k] for x in signals)) for k in range(3)]
-    np.testing.assert_array_equal(ours, np.stack(one_by_one))
