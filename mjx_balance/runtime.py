@@ -43,6 +43,8 @@ MOST_BYTES = 64 * 2**20
 """Larger files are no policies, whatever they say."""
 MOST_WHOLE = 100_000
 """Of any number of a manifest: far more than any policy has."""
+MOMENTARY = ("height",)
+"""Sensors that are read at a decision alone, so that they have one sample."""
 MOST_READ = 1_000_000
 """Samples that the inputs may be means of, all together."""
 GYRO_MOST = 35.0
@@ -340,12 +342,12 @@ class _Inputs:
                     f"{', '.join(channels)}"
                 )
             index = _whole("index", row["index"], 0, channels[sensor] - 1)
-            # Heights are measured at a decision; there are none of before.
-            most = 0 if sensor == "height" else MOST_WHOLE
+            most = 0 if sensor in MOMENTARY else MOST_WHOLE
             lag, window = _whole("lag", row["lag"], 0, most), _whole("window", row["window"], 1)
             self._ages[sensor] = max(self._ages[sensor], lag + window)
             groups.setdefault((sensor, window), []).append((k, index, lag))
-        if self._ages["height"] > 1 or sum(w * len(x) for (_, w), x in groups.items()) > MOST_READ:
+        samples = sum(window * len(group) for (_, window), group in groups.items())
+        if samples > MOST_READ or any(self._ages[sensor] > 1 for sensor in MOMENTARY):
             raise PolicyFileError("its inputs are means of more samples than there are")
         self.size = len(rows)
         self._offset = _numbers("offset", [row["offset"] for row in rows], (self.size,))

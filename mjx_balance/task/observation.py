@@ -92,9 +92,10 @@ def input_rows(task: TaskConfig, robot: Robot) -> tuple[Row, ...]:
     def legs(symbol: str, sensor: str, lag: int = 0, suffix: str = "") -> list[Row]:
         names = [f"{symbol}_{leg.name}{suffix}" for leg in robot.legs]
         scale = float(np.float32(task.height_scale))
+        mirrors = [Mirror(names[k], 1) for k in _partners(robot)]
         return [
-            Row(name, sensor, k, lag, 1, task.body_height, scale, Mirror(names[partner], 1))
-            for k, (name, partner) in enumerate(zip(names, _partners(robot), strict=True))
+            Row(name, sensor, k, lag, 1, task.body_height, scale, mirror)
+            for k, (name, mirror) in enumerate(zip(names, mirrors, strict=True))
         ]
 
     def axis(symbol: str, sensor: str, index: int, lag: int, scale: float, sign: int) -> Row:
