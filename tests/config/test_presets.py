@@ -1,11 +1,13 @@
 """What the presets and their flags amount to: gradient steps, replayed transitions, schedules."""
 
 import dataclasses
+import hashlib
+import json
 
 import numpy as np
 import pytest
 
-from mjx_balance.config import PRESETS, Config, ConfigError, check, preset
+from mjx_balance.config import PRESETS, Config, ConfigError, check, flatten, preset, to_dict
 from mjx_balance.training.sizing import size_to_device
 
 
@@ -63,3 +65,20 @@ def test_presets_fit_any_number_of_envs_that_their_batch_divides(name: str) -> N
     config = preset(name)
     for num_envs in (64, 256, 2_048):
         check(dataclasses.replace(config, num_envs=num_envs))
+
+
+@pytest.mark.parametrize(
+    ("name", "digest"),
+    [
+        ("default", "e82bd94e"),
+        ("best", "e0e79557"),
+        ("quick", "f614618b"),
+        ("smoke", "51dacd1d"),
+    ],
+)
+def test_presets_are_those_that_results_were_measured_with(name: str, digest: str) -> None:
+    """What differs from the paper's values, as a digest: who means to change it, changes it here."""
+    bare, own = (flatten(to_dict(config)) for config in (Config(), preset(name)))
+    changed = {field: value for field, value in own.items() if value != bare[field]}
+    found = hashlib.sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()[:8]
+    assert found == digest, changed
