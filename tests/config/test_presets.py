@@ -77,7 +77,7 @@ def test_presets_fit_any_number_of_envs_that_their_batch_divides(name: str) -> N
     ],
 )
 def test_presets_are_those_that_results_were_measured_with(name: str, digest: str) -> None:
-    """What differs from the paper's values, as a digest: who means to change it, changes it here."""
+    """Digests of what differs from the paper: who means to change it, changes it here."""
     bare, own = (flatten(to_dict(config)) for config in (Config(), preset(name)))
     changed = {field: value for field, value in own.items() if value != bare[field]}
     found = hashlib.sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()[:8]

@@ -145,10 +145,7 @@ def caught(work: tuple[Bug, Place, float]) -> str | None:
     bug, place, seconds = work
     file = modules()[place.module]
     with forks.changed(file, planted(bug, place, (REPO / file).read_text())):
-        for group in tests_of(place.module)[:2]:
-            if noticed := forks.failing(group, seconds):
-                return noticed
-    return None
+        return forks.noticed(tests_of(place.module)[:2], seconds)
 
 
 def main() -> int:

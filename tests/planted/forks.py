@@ -61,12 +61,33 @@ class Witness:
             self.failed.write_text(report.nodeid)
 
 
-def failing(files: Iterable[str], seconds: float) -> str | None:
+def noticed(groups: list[list[str]], seconds: float) -> str | None:
+    """Runs groups of test files until the first failure; of the nearest the slow tests too.
+
+    Args:
+      groups: paths from the repository's root, run in this order.
+      seconds: how long to go on for.
+
+    Returns:
+      What failed, or None if nothing did in the time.
+    """
+    until = time.monotonic() + seconds
+    runs: list[tuple[list[str], str | None]] = [(group, None) for group in groups]
+    runs[2:2] = [(group, "slow and not sb3 and not long") for group in groups[:1]]
+    for files, marker in runs:
+        left = until - time.monotonic()
+        if left > 0 and (failed := failing(files, left, marker)):
+            return failed
+    return None
+
+
+def failing(files: Iterable[str], seconds: float, marker: str | None = None) -> str | None:
     """Runs test files in this process' copy, in a fork, until the first failure.
 
     Args:
       files: paths from the repository's root, run in this order.
       seconds: how long to go on for.
+      marker: which of their tests, as pytest's `-m`; None: those that run by default.
 
     Returns:
       What failed, or None if nothing did in the time.
@@ -75,7 +96,7 @@ def failing(files: Iterable[str], seconds: float) -> str | None:
     witness = Witness(where)
     child = os.fork()
     if not child:
-        _become_pytest(where, [*files], witness)
+        _become_pytest(where, [*(["-m", marker] if marker else []), *files], witness)
     begin = time.monotonic()
     while (now := time.monotonic()) - begin < seconds + HANG_S:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -96,7 +117,7 @@ def failing(files: Iterable[str], seconds: float) -> str | None:
     return "the time limit" if hung else None
 
 
-def _become_pytest(where: Path, files: list[str], witness: Witness) -> None:
+def _become_pytest(where: Path, arguments: list[str], witness: Witness) -> None:
     """The child: becomes a pytest in `where`; does not return."""
     code = 1
     try:
@@ -110,7 +131,7 @@ def _become_pytest(where: Path, files: list[str], witness: Witness) -> None:
         sys.dont_write_bytecode = True
         # Of the pool's worker that this is a fork of: it would forbid tests to start processes.
         multiprocessing.current_process()._config.pop("daemon", None)  # pyright: ignore
-        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *files], [witness])
+        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *arguments], [witness])
     finally:
         os._exit(code)
 

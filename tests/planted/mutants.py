@@ -72,13 +72,8 @@ def drawn(count: int, seed: int, seconds: float) -> list[Mutant]:
 
 def caught(mutant: Mutant) -> str | None:
     """Plants a mutant in this process' copy for a while; returns what noticed it."""
-    until = time.monotonic() + mutant.seconds
     with forks.changed(mutant.file, mutant.content):
-        for group in tests_of(name_of(mutant.file))[:GROUPS]:
-            left = until - time.monotonic()
-            if left > 0 and (noticed := forks.failing(group, left)):
-                return noticed
-    return None
+        return forks.noticed(tests_of(name_of(mutant.file))[:GROUPS], mutant.seconds)
 
 
 def wilson(successes: int, count: int, z: float = 1.96) -> tuple[float, float]:
