@@ -88,36 +88,56 @@ def input_rows(task: TaskConfig, robot: Robot) -> tuple[Row, ...]:
       task: lags, window, scales, standing height.
       robot: names and sides of the legs.
     """
-
-    def legs(symbol: str, sensor: str, lag: int = 0, suffix: str = "") -> list[Row]:
-        names = [f"{symbol}_{leg.name}{suffix}" for leg in robot.legs]
-        scale = float(np.float32(task.height_scale))
-        mirrors = [Mirror(names[k], 1) for k in _partners(robot)]
-        return [
-            Row(name, sensor, k, lag, 1, task.body_height, scale, mirror)
-            for k, (name, mirror) in enumerate(zip(names, mirrors, strict=True))
-        ]
-
-    def axis(symbol: str, sensor: str, index: int, lag: int, scale: float, sign: int) -> Row:
-        name, scale = f"{symbol}_{'xyz'[index]},t-{lag}", float(np.float32(scale))
-        return Row(name, sensor, index, lag, task.imu_mean, 0.0, scale, Mirror(name, sign))
-
-    rows = legs("H", "height")
+    height, scale, mean = task.body_height, task.height_scale, task.imu_mean
+    rows = _leg_rows(robot, "H", "height", height, scale)
     for lag in task.command_lags:
-        rows += legs("C", "command", lag, f",d-{lag}")
-    for k in (0, 1):
-        for lag in task.gyro_lags:
-            rows.append(axis("V", "gyro", k, lag, task.gyro_scale, TURN_SIGNS[k]))
-    for k in (0, 1):
-        for lag in task.accel_lags:
-            rows.append(axis("Acc", "accelerometer", k, lag, task.accel_scale, MOTION_SIGNS[k]))
+        rows += _leg_rows(robot, "C", "command", height, scale, lag=lag)
+    rows += _axis_rows("V", "gyro", task.gyro_lags, mean, task.gyro_scale, TURN_SIGNS)
+    rows += _axis_rows(
+        "Acc", "accelerometer", task.accel_lags, mean, task.accel_scale, MOTION_SIGNS
+    )
     return tuple(rows)
 
 
-def _partners(robot: Robot) -> list[int]:
-    """The leg on the other side of each."""
+def _leg_rows(
+    robot: Robot,
+    symbol: str,
+    sensor: str,
+    offset: float,
+    scale: float,
+    sign: int = 1,
+    lag: int | None = None,
+) -> list[Row]:
+    """A row per leg; `sign` is that of the partner leg in the mirror, `lag` one of decisions."""
+    suffix = "" if lag is None else f",d-{lag}"
+    names = [f"{symbol}_{leg.name}{suffix}" for leg in robot.legs]
     sides = list(zip(robot.left, robot.front, strict=True))
-    return [sides.index((not left, front)) for left, front in sides]
+    mirrors = [Mirror(names[sides.index((not left, front))], sign) for left, front in sides]
+    scale = float(np.float32(scale))
+    return [
+        Row(name, sensor, k, lag or 0, 1, offset, scale, mirror)
+        for k, (name, mirror) in enumerate(zip(names, mirrors, strict=True))
+    ]
+
+
+def _axis_rows(
+    symbol: str,
+    sensor: str,
+    lags: Sequence[int],
+    window: int,
+    scale: float,
+    signs: Sequence[int],
+    axes: str = "xy",
+) -> list[Row]:
+    """A row per axis and lag; `signs` are those of x, y and z in the mirror."""
+    rows = []
+    for axis in axes:
+        index = "xyz".index(axis)
+        for lag in lags:
+            name, unit = f"{symbol}_{axis},t-{lag}", float(np.float32(scale))
+            mirror = Mirror(name, signs[index])
+            rows.append(Row(name, sensor, index, lag, window, 0.0, unit, mirror))
+    return rows
 
 
 def observation_names(task: TaskConfig, robot: Robot) -> tuple[str, ...]:
