@@ -276,7 +276,7 @@ def run_of_processes(count: int, *args: Any) -> Row:
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(count, spawn) as pool:
         runs = [pool.submit(process_row, place, *args) for place in places]
-        return [run.result() for run in runs][-count]
+        return runs[0].result()
 
 
 def typical_runs(engine: str, args: argparse.Namespace) -> dict[str, Row]:
@@ -302,7 +302,7 @@ def predicted(row: Row, one: Row, count: int) -> float:
 
 def processes(args: argparse.Namespace) -> None:
     """Table `processes`."""
-    rows, fastest = [], {"decisions_per_second": 0.0}
+    rows, one = [], {}
     for engine in args.engines:
         runs = typical_runs(engine, args)
         one = runs["one"]
@@ -313,13 +313,12 @@ def processes(args: argparse.Namespace) -> None:
             row |= {"efficiency": rate / one["decisions_per_second"] / count}
             row |= {"predicted": predicted(typical, one, count) if count > 1 else None}
             rows.append(row | {"exchange": 1e6 * typical["exchange_s"] if count > 1 else None})
-        fastest = max(fastest, one, key=lambda row: row["decisions_per_second"])
     forms = {"decisions/s": "{:,.0f}", "exchange": "{:.0f} us"}
     forms |= dict.fromkeys(("efficiency", "predicted"), "{:.2f}")
     note = (
         f"{common.machine()}, a core per process, preset default with "
-        f"{fastest['updates_per_decision']:.3f} updates per decision (weak: half as many of twice "
-        f"the size) of {fastest['gradient_bytes']:,.0f} bytes of gradients; medians of "
+        f"{one['updates_per_decision']:.3f} updates per decision (weak: half as many of twice "
+        f"the size) of {one['gradient_bytes']:,.0f} bytes of gradients; medians of "
         f"{args.repeats} runs of {args.rounds} calls; efficiency against the one process, and what "
         "it would be if processes lost nothing but their exchanges."
     )
