@@ -32,7 +32,7 @@ class Row(NamedTuple):
     """Unique, e.g. `H_LF`, `C_LF,d-1`, `V_x,t-2`, `Acc_y,t-15`."""
     sensor: str
     """One of `SENSORS`."""
-    index: int
+    index: int  # pyright: ignore[reportIncompatibleMethodOverride]
     """Leg in the robot's order, or axis: 0, 1, 2 for x, y, z."""
     lag: int
     """Age of the newest sample averaged, in samples of the sensor; 0 is the latest."""
