@@ -235,7 +235,7 @@ def test_impossible_commands_are_refused(
     assert (tmp_path / "text").read_text() == "this is no policy"
 
 
-@pytest.mark.parametrize("who", ["controller", "policy"])
+@pytest.mark.parametrize("who", ["controller", pytest.param("policy", marks=pytest.mark.slow)])
 def test_evaluate_writes_figures_and_a_video(
     who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, read_video: Any
 ) -> None:

@@ -103,6 +103,7 @@ def test_shares_are_those_of_the_physics_steps_in_each_bin(
     assert np.histogram([9.9, 10.0], edges)[0][-2:].tolist() == [1, 1], "up to where it fails"
 
 
+@pytest.mark.slow
 def test_what_was_measured_is_kept(
     policy: Policy,
     its_scene: Scene,
