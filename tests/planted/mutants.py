@@ -11,6 +11,7 @@ import argparse
 import difflib
 import os
 import random
+import re
 import sys
 import time
 from pathlib import Path
@@ -45,9 +46,17 @@ class Mutant(NamedTuple):
 
 
 def mutable(mutation: Mutation) -> bool:
-    """Not a sentence: what a message says in detail is not measured here."""
+    """Whether the mutation may change what the package does.
+
+    Neither a sentence, whose details are not measured here, nor `strict=True`, which changes
+    nothing but an error.
+    """
     node = mutation.original_node
-    return not (isinstance(node, libcst.SimpleString) and " " in node.value.strip("\"' "))
+    if isinstance(node, libcst.SimpleString) and " " in node.value.strip("\"' "):
+        return False
+    old, new = (libcst.Module([]).code_for_node(x) for x in (node, mutation.mutated_node))
+    loose = [re.sub(r",?\s*strict\s*=\s*\w+|,?\s*$|,?\s*(?=\))", "", text) for text in (old, new)]
+    return loose[0] != loose[1]
 
 
 def drawn(count: int, seed: int, seconds: float) -> list[Mutant]:

@@ -301,6 +301,7 @@ def damaged(draw: st.DrawFn, good: dict[str, Any]) -> dict[str, bytes]:
     return files
 
 
+@pytest.mark.slow
 @settings(deadline=1_000, max_examples=300, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_a_damaged_folder_is_read_as_far_as_it_goes(
