@@ -4,11 +4,9 @@ One command of at most eight minutes, for a GPU or without one:
   rates      physics steps per second of every engine, robots on their feet under a trained policy;
   training   the whole program of preset `default`, sized as a run on this device is, and its share
              of the best of these rates; on an accelerator, runs are sized by them from now on;
-  whole run  `train.py` with the fastest engine, started twice (cold, then warm): seconds from the
-             start of the process to a validation below 0.2 and 0.1 deg without a fall in both
-             headline suites, and the held-out evaluation of what comes out.
-Every part is a process of its own. One that fails, for want of memory, of a package or of time, is
-listed with the reason, and leaves the others alone.
+  whole run  `train.py` with the fastest engine, cold and warm: seconds from the start of the
+             process to a validation below 0.2 and 0.1 deg without a fall, and its evaluation.
+Every part is a process of its own. One that fails is listed with the reason.
 
     python benchmarks/accelerator.py [--json FILE] [--write benchmarks/README.md]
 """

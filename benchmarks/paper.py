@@ -1,17 +1,15 @@
 r"""Does the paper's DQN do what the paper says? The learning curve of preset `paper`.
 
 Evaluates every policy that runs of the preset validated on their way, on held-out scenarios, beside
-the evaluation after training. `--figure` copies the first run's picture of 100 s, the paper's
-Fig. 7.
+the evaluation after training. `docs/paper.png` is `figures/rollout.png` of the first run.
 
     for seed in 0 1 2; do python train.py --preset paper --engine mujoco --num-devices 1 \
         --log-every 1600 --eval-every 40000 --eval-scenarios 256 --seed $seed \
         --run-dir runs/paper-$seed; done
-    python benchmarks/paper.py runs/paper-? [--write README.md] [--figure docs/paper.png]
+    python benchmarks/paper.py runs/paper-? [--write README.md]
 """
 
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -36,7 +34,6 @@ def main() -> None:
     parser = common.arguments(__doc__)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--scenarios", type=int, default=64)
-    parser.add_argument("--figure", type=Path, help="where to copy the rollout's picture to")
     args = parser.parse_args()
     folders = [RunFolder(path) for path in args.runs]
     steps = sorted({int(path.name) for folder in folders for path in folder.validated.iterdir()})
@@ -50,8 +47,6 @@ def main() -> None:
         "greatest max."
     )
     common.report(args, "paper", rows, note)
-    if args.figure:
-        shutil.copyfile(folders[0].figures / "rollout.png", args.figure)
 
 
 if __name__ == "__main__":
