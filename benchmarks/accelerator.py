@@ -127,10 +127,7 @@ def whole_run(engine: str, num_envs: int, start: str, work: Path) -> Iterator[Ro
 
 
 def seconds_to(folder: RunFolder, began: float, most: float) -> float | None:
-    """Seconds to a validation with no fall and at most so many deg in both suites, of a whole run.
-
-    Its process `began` so many seconds after the epoch.
-    """
+    """Seconds from `began`, of the epoch, to a validation with no fall and at most so many deg."""
     for line in map(json.loads, folder.metrics.read_text().splitlines()):
         tilts = [line.get(f"eval/{suite}/tilt_mean", math.inf) for suite in HEADLINE]
         if max(tilts) <= most and not any(line[f"eval/{suite}/falls"] for suite in HEADLINE):

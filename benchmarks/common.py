@@ -28,8 +28,7 @@ def arguments(description: str | None, tables: Iterable[str] = ()) -> argparse.A
     """A parser with the flags that every script has; `tables` names its tables, if several."""
     parser = argparse.ArgumentParser(description=(description or "").splitlines()[0])
     if tables:
-        names = list(tables)
-        parser.add_argument("--table", choices=names, default=names[0], help="which to measure")
+        parser.add_argument("--table", choices=tables, default=next(iter(tables)))
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--write", type=Path, help="Markdown page that has the table's markers")
     return parser

@@ -1,10 +1,9 @@
 """Does what is learnt in training hold in plain MuJoCo?
 
 Tables, one per call (`--table`):
-  engines    one policy in the same scenarios over the training engines and in the evaluation.
-             Closed loop: the policy sees what its own robot's IMU reads. Open loop: the actions of
-             the evaluation are repeated and the IMU samples compared one by one. Without sensor
-             noise, which engines could not be given alike;
+  engines    one policy in the same scenarios over the training engines and in the evaluation,
+             without sensor noise. Closed loop: the policy sees what its own robot's IMU reads. Open
+             loop: the actions of the evaluation are repeated and the IMU samples compared;
   contact    the policy, every tenth action random as in training, under other solver settings;
   precision  preset `default` trained with products rounded as GPUs and TPUs round them, and with
              as many envs as an accelerator steps.

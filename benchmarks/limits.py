@@ -148,7 +148,6 @@ def gains_row(kind: type, suite: str, scenarios: int) -> Row:
     return {
         "baseline": kind.__name__,
         "best gains": ", ".join(f"{name} {value:g}" for name, value in best.items()),
-        "tried": len(scores),
         "mean deg": score(best),
         "held out": mean(best, SEEDS.held_out),
     }

@@ -5,7 +5,7 @@
 At every checkpoint the process prints its decisions so far, then the evaluations of its greedy
 policy as a line of JSON, and waits for a line on its input; the end of the input ends it.
 
-    python benchmarks/peers.py sb3 [--decisions 200000] [--every 5000] [--seed 0]
+    python benchmarks/peers.py sb3 [--decisions 200000] [--every 5000]
 """
 
 import argparse
@@ -45,7 +45,7 @@ def checkpoint(scenarios: int, decisions: int, scene: Scene, controller: Control
         raise SystemExit
 
 
-def train_sb3(report: Callable[..., None], decisions: int, every: int, seed: int) -> None:
+def train_sb3(report: Callable[..., None], decisions: int, every: int) -> None:
     """Trains stable-baselines3's DQN; `report` takes decisions, scene and controller."""
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import DQN  # pyright: ignore[reportMissingImports]
@@ -53,7 +53,7 @@ def train_sb3(report: Callable[..., None], decisions: int, every: int, seed: int
 
     from mjx_balance.envs.gym import BalanceGymEnv
 
-    config = dataclasses.replace(preset("default"), engine="mujoco", seed=seed)
+    config = dataclasses.replace(preset("default"), engine="mujoco")
     scene = load_scene(config)
 
     class Checkpoints(BaseCallback):
@@ -78,15 +78,13 @@ def train_sb3(report: Callable[..., None], decisions: int, every: int, seed: int
         exploration_fraction=min(1.0, EXPLORE / decisions),
         exploration_final_eps=0.05,
         policy_kwargs={"net_arch": list(HIDDEN)},
-        seed=seed,
+        seed=0,
         device="cpu",
     )
     model.learn(decisions, callback=Checkpoints())
 
 
-def train_brax(
-    name: str, report: Callable[..., None], decisions: int, every: int, seed: int
-) -> None:
+def train_brax(name: str, report: Callable[..., None], decisions: int, every: int) -> None:
     """Trains brax's "ppo" or "sac"; as `train_sb3`."""
     import jax
     from brax.training.agents.sac import checkpoint as sac_checkpoint
@@ -113,7 +111,7 @@ def train_brax(
             "sac": {"checkpoint_logdir": folder, "progress_fn": on_progress},
         }
         num_evals = 1 + max(1, decisions // every)
-        example["train"](name, env, decisions, seed, num_evals=num_evals, **callbacks[name])
+        example["train"](name, env, decisions, 0, num_evals=num_evals, **callbacks[name])
 
 
 PEERS = {
@@ -129,12 +127,11 @@ def main() -> None:
     parser.add_argument("peer", choices=PEERS)
     parser.add_argument("--decisions", type=int, default=200_000)
     parser.add_argument("--every", type=int, default=5_000, help="decisions between checkpoints")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scenarios", type=int, default=64, help="of each evaluation")
     args = parser.parse_args()
     with contextlib.redirect_stdout(sys.stderr):
         report = functools.partial(checkpoint, args.scenarios)
-        PEERS[args.peer](report, args.decisions, args.every, args.seed)
+        PEERS[args.peer](report, args.decisions, args.every)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ import functools
 import importlib.util
 import itertools
 import statistics
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -117,25 +116,22 @@ def program(buffer: Buffer, make: Callable[[jax.Array], Transition], adds: int, 
     return jax.jit(run, donate_argnums=0)
 
 
-def measure(obs_size: int, num_envs: int, rounds: int) -> tuple[list[Row], dict[str, float]]:
-    """Two rows, all contenders while they fill and full, in us; seconds of their compiling."""
+def measure(obs_size: int, num_envs: int, rounds: int) -> list[Row]:
+    """Two rows, us of all contenders while they fill, and full."""
     make = functools.partial(decision, obs_size, num_envs)
     key, contenders = jax.random.PRNGKey(0), buffers(obs_size, num_envs)
-    calls, states, compile_s, rows = {}, {}, {}, []
-    for name, buffer in contenders.items():
-        states[name], began = buffer.init(), time.perf_counter()
-        compiled = program(buffer, make, ADDS, SAMPLES).lower(states[name], key).compile()
-        compile_s[name] = time.perf_counter() - began
+    states = {name: buffer.init() for name, buffer in contenders.items()}
+    runs = {name: program(buffer, make, ADDS, SAMPLES) for name, buffer in contenders.items()}
 
-        def call(name: str = name, compiled: Any = compiled) -> None:
-            states[name], _ = jax.block_until_ready(compiled(states[name], key))
+    def call(name: str) -> None:
+        states[name], _ = jax.block_until_ready(runs[name](states[name], key))
 
-        calls[name] = call
+    calls, rows = {name: functools.partial(call, name) for name in runs}, []
     for phase in ("filling", "full"):
         for name, buffer in contenders.items() if phase == "full" else ():
             fill = program(buffer, make, CAPACITY // num_envs, 0)
             states[name], _ = fill(states[name], key)
-        # The first round is a warm-up. Who comes after brax, which moves all its rows, finds cold
+        # The first round compiles. Who comes after brax, which moves all its rows, finds cold
         # caches: the order changes.
         seconds = {
             name: [second / ADDS for second in those[1:]]
@@ -146,7 +142,7 @@ def measure(obs_size: int, num_envs: int, rounds: int) -> tuple[list[Row], dict[
         row = {"inputs": obs_size, "envs": num_envs, "buffer": phase}
         row |= {name: 1e6 * median for name, median in medians.items()}
         rows.append(row | {"ours / best other": common.ratio(seconds[best], seconds["ours"])})
-    return rows, compile_s
+    return rows
 
 
 def main() -> None:
@@ -158,20 +154,16 @@ def main() -> None:
         parser.error(f"--rounds is {args.rounds}; it must be 1 to {MOST_ROUNDS}")
     if importlib.util.find_spec("flashbax") is None:
         parser.error("flashbax is not installed: pip install -e '.[benchmarks]'")
-    rows, compile_s = [], {}
+    rows = []
     for obs_size, num_envs in itertools.product(OBS_SIZES, NUM_ENVS):
         common.log(f"measuring {obs_size} inputs, {num_envs} envs ...")
-        more, seconds = measure(obs_size, num_envs, args.rounds)
-        rows, compile_s = rows + more, compile_s or seconds
-    names = list(compile_s)
-    forms = {"ours / best other": "{:.2f}", **dict.fromkeys(names, "{:,.0f}")}
-    compiles = ", ".join(f"{name} {x:.2f} s" for name, x in compile_s.items())
+        rows += measure(obs_size, num_envs, args.rounds)
+    times = dict.fromkeys(list(rows[0])[3:-1], "{:,.0f}")
     note = (
         f"Microseconds for one add and {SAMPLES} samples of {BATCH}, {CAPACITY:,} rows; ratio of "
-        f"rates; medians of {args.rounds} rounds; {common.machine()}. Compiling the first row: "
-        f"{compiles}."
+        f"rates; medians of {args.rounds} rounds; {common.machine()}."
     )
-    common.report(args, "replay", rows, note, forms)
+    common.report(args, "replay", rows, note, times | {"ours / best other": "{:.2f}"})
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ SMALLEST = {
     "throughput.py --table processes --engines mujoco --num-envs 64 --rounds 1 --repeats 1": "weak",
     "throughput.py --table gymnasium --num-envs 4 --rounds 1": "| 4 |",
     "time_to_balance.py --contenders mujoco --decisions 640 --scenarios 2": "| mujoco | warm |",
-    "time_to_balance.py --contenders ppo sac --most 2048 --every 2048 --scenarios 2": "| sac |",
+    "time_to_balance.py --contenders ppo sac --most 4096 --every 4096 --scenarios 1": "| sac |",
     "time_to_balance.py --contenders sb3 --most 2000 --every 2000 --scenarios 2": "| sb3 | cold |",
     "accelerator.py --budget 400 --engines mujoco --sizes 64": "`train.py --engine mujoco`, warm",
     "fidelity.py --scenarios 2 --periods 1": "| latency |",
@@ -414,10 +414,9 @@ def test_replay_compares_as_many_adds_and_samples(monkeypatch: pytest.MonkeyPatc
     for ours, others, low, high in ((slow, (fast, slow), 0, 0.5), (fast, (slow, slow), 2, 1e9)):
         contenders = dict(zip(("ours", "a", "b"), (ours, *others), strict=True))
         monkeypatch.setattr(module, "buffers", lambda *size, found=contenders: found)
-        rows, compile_s = module.measure(1, 256, 3)
+        rows = module.measure(1, 256, 3)
         assert [row["buffer"] for row in rows] == ["filling", "full"]
         assert all(low < row["ours / best other"] < high for row in rows)
-        assert compile_s.keys() == contenders.keys()
 
 
 def test_a_threshold_is_reached_by_a_validation_without_a_fall_in_both_suites(
