@@ -626,6 +626,18 @@ def test_the_weakest_motor_of_a_kind_counts(tmp_path: Path) -> None:
     assert (robot.hip_torque, robot.knee_torque) == (20.0, 30.0)
 
 
+def test_a_robots_size_is_by_its_furthest_foot_on_either_axis(robot: Robot) -> None:
+    """Feet at 0.15 and -0.11 m fore-aft, at 0.3 m and -0.2 m aside: wider than long."""
+    legs = [
+        dataclasses.replace(leg, x=0.15 if leg.front else -0.11, y=0.3 if leg.left else -0.2)
+        for leg in robot.legs
+    ]
+    wide = dataclasses.replace(robot, legs=tuple(legs))
+    assert (wide.half_length, wide.half_track) == (0.15, 0.3)
+    assert wide.lever == pytest.approx(0.25), "half of what the feet span"
+    assert wide.size_scale == round(0.3 / 0.193, 3)
+
+
 def test_unequal_legs_count_by_their_mean(tmp_path: Path) -> None:
     """Hind shanks of 180 mm: 0.77 of 0.426 and 0.393 m and the foot; servos by (l h / y)^2."""
     spec = bodies.our_spec()
