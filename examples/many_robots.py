@@ -21,12 +21,13 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from mjx_balance.config import Config, fitted, preset
+from mjx_balance.config import Config, preset
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.policy.file import Policy, load_policy, save_policy
 from mjx_balance.robots.catalogue import shipped
+from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.engines.mujoco import cores
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.training import sizing
@@ -119,7 +120,7 @@ def main() -> None:
         num_env_steps=args.decisions * len(trained),
     )
     sized = sizing.size_to_device(base)
-    configs = {name: fitted(sized, name) for name in (*trained, *args.unseen)}
+    configs = {name: for_robot(sized, name) for name in (*trained, *args.unseen)}
     seen = {name: configs[name] for name in trained}
     files = {name: args.out / f"{name}.safetensors" for name in configs}
     if not all(file.is_file() for file in files.values()):

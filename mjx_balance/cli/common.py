@@ -3,11 +3,12 @@
 import sys
 from pathlib import Path
 
-from mjx_balance.config import check, fitted, preset
+from mjx_balance.config import check, preset
 from mjx_balance.errors import USAGE_ERROR, InputError
 from mjx_balance.evaluation import rollout
 from mjx_balance.evaluation.controllers import Controller, ControllerError, make_controller
 from mjx_balance.policy.file import load_policy
+from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import Scene, load_scene
 
 HELP = ("-h", "--help")
@@ -61,5 +62,5 @@ def load_controller(
         loaded = load_policy(policy)
         return rollout.policy_scene(loaded, robot=robot), rollout.observing(loaded)
     assert baseline is not None
-    scene = load_scene(check(fitted(preset("default"), robot or "quadruped")))
+    scene = load_scene(check(for_robot(preset("default"), robot or "quadruped")))
     return scene, make_controller(baseline, scene)

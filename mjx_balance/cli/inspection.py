@@ -7,9 +7,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.config import Config, check, fitted, greatest_incline, preset
-from mjx_balance.evaluation.suites import authority
+from mjx_balance.config import Config, check, preset
 from mjx_balance.robots.catalogue import Robot
+from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.robots.measure import UNLIMITED
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.attitude import body_tilt
@@ -48,7 +48,7 @@ def inspect(robot: str) -> tuple[Scene, TiltTest]:
     Raises:
       ConfigError: if it cannot be built, or does not stand.
     """
-    config = check(fitted(preset("default"), robot))
+    config = check(for_robot(preset("default"), robot))
     scene = load_scene(config)
     return scene, tilt_board(scene)
 
@@ -152,7 +152,7 @@ def _legs(robot: Robot) -> list[str]:
 
 
 def _abilities(config: Config, robot: Robot) -> list[str]:
-    able, reach = authority(config), greatest_incline(config.task, robot)
+    able, reach = authority(config.task, robot), greatest_incline(config.task, robot)
     task = config.task
     return [
         f"height changes up to {1000 * task.action_max:.2f} mm follow {able:.2f} deg/s, "

@@ -7,11 +7,11 @@ import tyro
 from rich.console import Console
 
 from mjx_balance.cli.common import HELP, complain
-from mjx_balance.config import Config, fitted, preset
+from mjx_balance.config import Config, preset, read_run_config
 from mjx_balance.errors import FAILED, INTERRUPTED, how_to_install
-from mjx_balance.files.run_folder import read_run_config
 from mjx_balance.policy.file import PolicyError
 from mjx_balance.quiet import quiet_imports
+from mjx_balance.robots.limits import for_robot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,7 @@ def _parse(argv: list[str]) -> TrainArgs:
     """The flags; what they leave out is the preset's, the robot's or the resumed run's."""
     start, _ = tyro.cli(StartingPoint, args=argv, return_unknown_args=True, add_help=False)
     if start.resume is None:
-        default = TrainArgs(config=fitted(preset(start.preset), start.robot))
+        default = TrainArgs(config=for_robot(preset(start.preset), start.robot))
     else:
         default = TrainArgs(config=read_run_config(start.resume))
     return tyro.cli(TrainArgs, args=argv, prog="mjx-balance train", default=default)

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from mjx_balance.config import greatest_incline
 from mjx_balance.evaluation.controllers import Controller
 from mjx_balance.evaluation.rollout import Trials, suite_trials
 from mjx_balance.evaluation.suites import check_seed
+from mjx_balance.robots.limits import greatest_incline
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task import tilt
 from mjx_balance.task.pushes import Pushes

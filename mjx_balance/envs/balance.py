@@ -35,7 +35,8 @@ class BalanceEnv(Env):
         """Builds the scene.
 
         Args:
-          config: the preset "default" if none; another robot's is made by `config.fitted`.
+          config: the preset "default" if none; `robots.limits.for_robot` makes
+            another robot's.
           action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
             `action_max`, -1 to 1.
 

@@ -11,11 +11,13 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mjx_balance.config import Config, ConfigError, TaskConfig, fitted, shown
+from mjx_balance.config import Config, ConfigError, TaskConfig
 from mjx_balance.config import preset as find_preset
 from mjx_balance.envs.batch import Boards, Step
+from mjx_balance.files.text import quote
 from mjx_balance.render.drawing import Painter, RenderError, Window
 from mjx_balance.robots.catalogue import Robot
+from mjx_balance.robots.limits import for_robot
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.decision import ABSURD
 from mjx_balance.task.observation import input_rows
@@ -62,27 +64,27 @@ def _named(action: Any, array: np.ndarray | None, single: spaces.Space) -> str:
     if array is not None and array.ndim == len(single.shape or ()) + 1:
         for k, own in enumerate(array):
             if not single.contains(own):
-                return f"action {k} is {shown(own.tolist())}"
-    return f"action is {shown(action)}"
+                return f"action {k} is {quote(own.tolist())}"
+    return f"action is {quote(action)}"
 
 
 def _config(preset: str | None, config: Config | None, robot: str | None) -> Config:
     """The one that is named, made for a robot; the preset "default" if none is."""
     for name, value in (("preset", preset), ("robot", robot)):
         if value is not None and not isinstance(value, str):
-            raise ConfigError(f"{name} is {shown(value)}; it must be a name")
+            raise ConfigError(f"{name} is {quote(value)}; it must be a name")
         if value is not None and config is not None:
-            raise ConfigError(f"{name} is {shown(value)}, and a config is given; leave one out")
+            raise ConfigError(f"{name} is {quote(value)}, and a config is given; leave one out")
     if config is not None:
         return config
     named = find_preset("default" if preset is None else preset)
-    return named if robot is None else fitted(named, robot)
+    return named if robot is None else for_robot(named, robot)
 
 
 def _check_options(options: dict[str, Any] | None) -> None:
     """Refuses what a reset would not do, as Gymnasium's `reset_mask`: every board starts anew."""
     if options:
-        raise ValueError(f"options is {shown(options)}; it must be None or {{}}: there are none")
+        raise ValueError(f"options is {quote(options)}; it must be None or {{}}: there are none")
 
 
 def _seeds(seed: Any, count: int) -> list[int | None]:
@@ -98,7 +100,7 @@ def _seeds(seed: Any, count: int) -> list[int | None]:
     seeds = np.asarray(seed, object)
     if seeds.ndim != 1:
         raise ValueError(
-            f"seed is {shown(seed)}; it must be a whole number, or one or None for each env"
+            f"seed is {quote(seed)}; it must be a whole number, or one or None for each env"
         )
     if len(seeds) != count:
         raise ValueError(f"{len(seeds)} seeds are given for {count} envs")
@@ -115,7 +117,7 @@ def _observations(task: TaskConfig, robot: Robot) -> spaces.Box:
 def _check_mode(mode: str | None, known: Sequence[str]) -> None:
     if mode is not None and mode not in known:
         raise UnsupportedMode(
-            f"render_mode is {shown(mode)}; it must be one of {', '.join(known)}, or None"
+            f"render_mode is {quote(mode)}; it must be one of {', '.join(known)}, or None"
         )
 
 
@@ -145,7 +147,7 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
             `action_max`, -1 to 1.
           render_mode: "human", a window in which every decision takes its time; "rgb_array"; or
             none.
-          robot: as `Config.robot`, to which the preset is fitted; our own if none.
+          robot: as `Config.robot`, for which the preset is made; our own if none.
 
         Raises:
           ConfigError: for an unknown preset, robot or kind of action, or a config that cannot be
@@ -260,7 +262,7 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
           config: instead of preset and robot.
           action: "discrete" or "continuous".
           render_mode: "rgb_array", one picture for each board, or none.
-          robot: to which the preset is fitted.
+          robot: for which the preset is made.
 
         Raises:
           ConfigError: as `BalanceGymEnv`.
@@ -269,7 +271,7 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         _check_mode(render_mode, self.metadata["render_modes"])
         whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
         if not whole or num_envs < 1:
-            raise ConfigError(f"num_envs is {shown(num_envs)}; it must be a whole number above 0")
+            raise ConfigError(f"num_envs is {quote(num_envs)}; it must be a whole number above 0")
         self.boards = Boards(_config(preset, config, robot), num_envs)
         task = self.boards.config.task
         self._actions = _Actions(task, action)

@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 
-from mjx_balance.config import TaskConfig, greatest_incline
+from mjx_balance.config import TaskConfig
 from mjx_balance.envs.batch import take
 from mjx_balance.errors import InputError
 from mjx_balance.evaluation.controllers import Controller, View
-from mjx_balance.evaluation.suites import authority, find_suite, make_pushes, make_scenarios
+from mjx_balance.evaluation.suites import find_suite, make_pushes, make_scenarios
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.robots.catalogue import RobotError, find_robot
+from mjx_balance.robots.limits import authority, greatest_incline
 from mjx_balance.sim.engines.mujoco import Motion, MujocoEngine
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task import decision, tilt
@@ -384,9 +385,9 @@ class Envelope:
     mean_tilt: list[list[float]]
     """[incline][rate] deg, a fall counting as fail_tilt to the end."""
     authority: float
-    """Speed beyond which the action set cannot follow, deg/s (`suites.authority`)."""
+    """Speed beyond which the action set cannot follow, deg/s (`limits.authority`)."""
     reach: float
-    """Incline beyond which the legs are too short, deg (`config.greatest_incline`)."""
+    """Incline beyond which the legs are too short, deg (`limits.greatest_incline`)."""
     scenarios: int
     """Per cell."""
     duration_s: float
@@ -437,7 +438,7 @@ def envelope(
         rates=list(ENVELOPE_RATES),
         fall_rate=rollout.fell.reshape(shape).mean(axis=-1).tolist(),
         mean_tilt=rollout.tilt.mean(axis=-1).reshape(shape).mean(axis=-1).tolist(),
-        authority=authority(scene.config),
+        authority=authority(scene.config.task, scene.robot),
         reach=greatest_incline(task, scene.robot),
         scenarios=scenarios,
         duration_s=duration,

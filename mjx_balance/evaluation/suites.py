@@ -1,14 +1,14 @@
 """The evaluation suites: which boards and circumstances a controller is tried on."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 
 import numpy as np
 
-from mjx_balance.config import Config, RandomizationConfig, greatest_incline, scaled_to
+from mjx_balance.config import Config, RandomizationConfig
 from mjx_balance.errors import InputError
 from mjx_balance.robots.catalogue import find_robot
+from mjx_balance.robots.limits import authority, greatest_incline, scale_ranges
 from mjx_balance.task import tilt
 from mjx_balance.task.pushes import Pushes, draw_kicks, kicked_decisions
 from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
@@ -16,16 +16,6 @@ from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
 
 class SuiteError(InputError):
     """A suite that does not exist, or does not suit the config; the message says why."""
-
-
-def authority(config: Config) -> float:
-    """Greatest board speed that the action set can follow on both axes, deg/s.
-
-    `action_max` per decision over the longer of the two half-tracks, fore-aft.
-    """
-    robot = find_robot(config.robot)
-    speed = config.task.action_max / config.task.ctrl_dt
-    return math.degrees(speed / robot.lever)
 
 
 def _disc(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
@@ -135,7 +125,7 @@ def make_scenarios(
     others = np.asarray([rng.uniform(size=DRAWS + 2) for rng in rngs])
     rate, incline = np.full(scenarios, task.board_rate), np.full(scenarios, task.max_incline)
     if chosen.fast:
-        rate += np.maximum(authority(config) - task.board_rate, 0) * others[:, DRAWS]
+        rate += np.maximum(authority(task, robot) - task.board_rate, 0) * others[:, DRAWS]
     if chosen.steep:
         steepest = greatest_incline(task, robot)
         incline += np.maximum(steepest - task.max_incline, 0) * others[:, DRAWS + 1]
@@ -146,7 +136,7 @@ def make_scenarios(
             f"{longest:.1f} s to its target; the period must not be shorter"
         )
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
-    ranges = scaled_to(chosen.randomization, robot)
+    ranges = scale_ranges(chosen.randomization, robot)
     return scenario, draw_conditions(ranges, robot, others[:, :DRAWS])
 
 
@@ -160,7 +150,7 @@ def make_pushes(config: Config, suite: str, scenarios: int, duration: float, see
     Raises:
       SuiteError: for an unknown suite.
     """
-    ranges = scaled_to(find_suite(suite).randomization, find_robot(config.robot))
+    ranges = scale_ranges(find_suite(suite).randomization, find_robot(config.robot))
     at = kicked_decisions(config.task, ranges, duration)
     rngs = [np.random.default_rng((seed, k, 2)) for k in range(scenarios)]
     uniform = np.asarray([rng.uniform(size=(len(at), 2)) for rng in rngs])

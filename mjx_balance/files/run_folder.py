@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mjx_balance.config import Config, check, flatten, from_dict, to_dict
 from mjx_balance.errors import InputError
+from mjx_balance.files.text import MESSAGE, shorten
 
 if sys.platform == "win32":
     import msvcrt
@@ -24,8 +24,6 @@ else:
 
 READ_AT_MOST = 2**20
 """Bytes of a JSON file of a run; those of ours take some kilobytes."""
-SAID_AT_MOST = 300
-"""Characters of another's error that a message repeats."""
 
 
 class RunFolderError(InputError):
@@ -148,12 +146,14 @@ def write_json(path: Path, values: Any) -> None:
     write_atomically(path, json.dumps(values, indent=2) + "\n")
 
 
-def create_run_folder(path: Path, config: Config, provenance: Mapping[str, Any]) -> RunFolder:
+def create_run_folder(
+    path: Path, config: Mapping[str, Any], provenance: Mapping[str, Any]
+) -> RunFolder:
     """Makes a new run folder: it has all it takes to resume from the moment it exists.
 
     Args:
       path: of the folder.
-      config: of the run.
+      config: of the run, in JSON values.
       provenance: what else decides it, in JSON values; see `check_same_provenance`.
 
     Raises:
@@ -168,7 +168,7 @@ def create_run_folder(path: Path, config: Config, provenance: Mapping[str, Any])
     shutil.rmtree(part, ignore_errors=True)  # of a dead process of that number
     try:
         part.mkdir(parents=True)
-        write_json(RunFolder(part).config, to_dict(config))
+        write_json(RunFolder(part).config, config)
         write_json(RunFolder(part).provenance, provenance)
         part.rename(path)
     except OSError as error:
@@ -202,8 +202,8 @@ def locked(folder: RunFolder) -> Iterator[None]:
         yield
 
 
-def read_run_config(path: Path) -> Config:
-    """Reads the config of an existing run that is not finished.
+def unfinished_run(path: Path) -> RunFolder:
+    """Finds a run to continue.
 
     Raises:
       RunFolderError: if `path` is no run folder, or its run is finished.
@@ -213,10 +213,7 @@ def read_run_config(path: Path) -> Config:
         raise RunFolderError(f"{path} is no run folder: it has no config.json")
     if folder.evaluation.is_file():
         raise RunFolderError(f"the run in {path} is finished; start a new one with --run-dir")
-    try:
-        return check(from_dict(Config, read_json(folder.config)))
-    except ValueError as error:
-        raise RunFolderError(f"{folder.config} cannot be used: {_brief(error)}") from error
+    return folder
 
 
 def read_json(file: Path) -> Any:
@@ -244,27 +241,6 @@ def parse_json(content: bytes) -> Any:
         raise ValueError(f"it is no JSON: {error}") from error
 
 
-def _brief(error: Exception) -> str:
-    """What an error says, in one line that is not too long."""
-    said = " ".join(str(error).split())
-    return said if len(said) <= SAID_AT_MOST else f"{said[:SAID_AT_MOST]} ..."
-
-
-def check_same_config(saved: Config, wanted: Config, path: Path) -> None:
-    """Refuses to resume a run as another one.
-
-    Raises:
-      RunFolderError: naming the first field that differs.
-    """
-    before, after = flatten(to_dict(saved)), flatten(to_dict(wanted))
-    for name, value in after.items():
-        if before[name] != value:
-            raise RunFolderError(
-                f"{path} was started with {name} = {before[name]}, not {value}; resume it "
-                "without that flag, or start a new run"
-            )
-
-
 def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
     """Compares what a run was started with, besides its config, with what there is today.
 
@@ -284,7 +260,7 @@ def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
         versions = dict(saved["versions"])
     except (LookupError, TypeError, ValueError) as error:
         raise RunFolderError(
-            f"{file} cannot be used: {_brief(error)}; start a new run with --run-dir"
+            f"{file} cannot be used: {shorten(error, MESSAGE)}; start a new run with --run-dir"
         ) from error
     for name, value in today.items():
         if name != "versions" and saved.get(name) != value:

@@ -13,8 +13,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from mjx_balance.config import shown
 from mjx_balance.files.run_folder import RunFolder, write_atomically
+from mjx_balance.files.text import quote
 from mjx_balance.policy.manifest import PolicyError
 from mjx_balance.policy.network import Policy
 
@@ -89,7 +89,7 @@ def find_policy(name: str | os.PathLike[str]) -> Path:
                 return file
     except OSError as error:  # a name that is too long
         raise PolicyError(
-            f"policy is {shown(str(path))}; it cannot be read: {error.strerror}"
+            f"policy is {quote(str(path))}; it cannot be read: {error.strerror}"
         ) from error
     if str(path) not in shipped:
         raise PolicyError(
@@ -145,7 +145,7 @@ def _read(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
             # NumPy has no name for some of the types that safetensors knows.
             if file.get_slice(name).get_dtype() != "F32":
                 kind = file.get_slice(name).get_dtype()
-                raise PolicyError(f"weight {shown(name)} is {kind}; it must be F32 (float32)")
+                raise PolicyError(f"weight {quote(name)} is {kind}; it must be F32 (float32)")
         weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     try:
         return json.loads(text), weights

@@ -9,10 +9,12 @@ import importlib.metadata
 from collections.abc import Mapping
 from typing import Any
 
-from mjx_balance.config import ACTION_AXES, Config, ConfigError, check, from_dict, shown, to_dict
+from mjx_balance.config import ACTION_AXES, Config, ConfigError, check, from_dict, to_dict
 from mjx_balance.errors import InputError
+from mjx_balance.files.text import quote
 from mjx_balance.policy import heads
 from mjx_balance.robots.catalogue import Robot, find_robot, robot_from_dict
+from mjx_balance.robots.limits import check_robot
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import input_rows
 
@@ -92,7 +94,7 @@ def read_manifest(manifest: Any) -> tuple[Config, Robot]:
         value = manifest.get(name)
         if value != expected:
             remedy = REMEDY if value == CONVERTIBLE else ""
-            raise PolicyError(f"{name} is {shown(value)}; this release reads {expected!r}{remedy}")
+            raise PolicyError(f"{name} is {quote(value)}; this release reads {expected!r}{remedy}")
     config, robot = config_and_robot(manifest)
     for part, expected in describe(config, robot).items():
         if manifest.get(part) != expected:
@@ -110,13 +112,13 @@ def config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
     for name, kind in kinds.items():
         if not isinstance(manifest.get(name), kind):
             right = {dict: "a JSON object", str: "a string"}[kind]
-            raise PolicyError(f"its {name} is {shown(manifest.get(name))}; it must be {right}")
+            raise PolicyError(f"its {name} is {quote(manifest.get(name))}; it must be {right}")
     try:
         robot = robot_from_dict(manifest["robot"])
     except ValueError as error:
         raise PolicyError(f"its robot cannot be used: {error}") from error
     try:
-        return check(from_dict(Config, manifest["config"]), robot), robot
+        return check_robot(check(from_dict(Config, manifest["config"])), robot), robot
     except ConfigError as error:
         raise PolicyError(f"its config cannot be used: {error}") from error
 

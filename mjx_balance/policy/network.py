@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_balance.config import shown
+from mjx_balance.files.text import quote
 from mjx_balance.policy import heads
 from mjx_balance.policy.manifest import PolicyError, network_factors, read_manifest
 from mjx_balance.task.actions import action_table
@@ -101,7 +101,7 @@ def _check_weights(
 ) -> None:
     extra = sorted(set(weights) - set(shapes))
     if extra:
-        raise PolicyError(f"weight {shown(extra[0])} is none of this network's")
+        raise PolicyError(f"weight {quote(extra[0])} is none of this network's")
     for name, shape in shapes.items():
         if name not in weights:
             raise PolicyError(f"weight {name} is missing")

@@ -10,7 +10,7 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
-from mjx_balance.config import Config, check, from_dict
+from mjx_balance.config import Config, read_config
 from mjx_balance.errors import InputError
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder, parse_json, read_json
@@ -78,7 +78,7 @@ def read_run(path: Path) -> Run:
             run.missing.append(f"{file} cannot be used: {why(error)}")
             return None
 
-    run.config = read(folder.config, lambda f: check(from_dict(Config, section(read_json(f)))))
+    run.config = read(folder.config, read_config)
     run.metrics = read(folder.metrics, lambda f: _read_metrics(f, run.missing)) or []
     run.policy = read(folder.policy, load_policy)
     own = read(folder.evaluation, lambda f: suite_results(read_json(f)))

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_balance.files.text import quote
 from mjx_balance.robots.measure import Pose, check_joints, measured
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import Foot, RobotError, RobotFile
@@ -247,19 +248,19 @@ class _Found(NamedTuple):
         return geom if geom and geom.type == mujoco.mjtGeom.mjGEOM_SPHERE else None
 
 
-def _foot(spec: mujoco.MjSpec, foot: Foot, leg: str) -> _Found:
+def _foot(spec: mujoco.MjSpec, foot: str | Foot, leg: str) -> _Found:
     origin = (0.0, 0.0, 0.0)
-    if foot.offset is not None:
-        body = _find(spec.bodies[1:], foot.name, f"foot of leg {leg}", "bodies")
+    if isinstance(foot, Foot):
+        body = _find(spec.bodies[1:], foot.body, f"foot of leg {leg}", "bodies")
         return _Found(body, foot.offset, None)
     for element in (*spec.geoms, *spec.sites):
-        if element.name == foot.name:
+        if element.name == foot:
             return _Found(element.parent, origin, element)
     for body in spec.bodies:
-        if body.name == foot.name:
+        if body.name == foot:
             return _Found(body, origin, None)
     raise RobotError(
-        f"foot of leg {leg} is {foot.name!r}, which is no geom, site or body of its model"
+        f"foot of leg {leg} is {quote(foot)}, which is no geom, site or body of its model"
     )
 
 

@@ -1,19 +1,18 @@
 """A robot's numbers, found on its compiled model; what depends on its size follows from them."""
 
 import dataclasses
-import json
 import math
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
+from mjx_balance.files.validation import check_types
 from mjx_balance.robots.robot import (
     OUR_LEVER,
     OUR_MASS,
     Leg,
     Robot,
-    robot_from_dict,
 )
 from mjx_balance.robots.schema import LegFile, RobotError, RobotFile
 
@@ -83,11 +82,8 @@ def measured(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: fl
     sized["servo_armature"] = _digits(OUR_ARMATURE * stiffer)
     said = {name: getattr(file, name) or value for name, value in sized.items()}
     robot = dataclasses.replace(robot, **said)
-    try:  # a policy carries it; better refused now than when a training has ended
-        robot_from_dict(json.loads(json.dumps(dataclasses.asdict(robot))))
-    except ValueError as error:
-        raise RobotError(str(error)) from error
-    return robot
+    # A policy carries it: better refused now than when a training has ended.
+    return check_types(robot, RobotError)
 
 
 def check_joints(model: mujoco.MjModel, file: RobotFile) -> None:

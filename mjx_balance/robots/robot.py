@@ -2,14 +2,16 @@
 
 import dataclasses
 import math
-import typing
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le, Len
 
-T = TypeVar("T")
+from mjx_balance.files.validation import STRICT, parse
 
+MOST = 1e7
+"""Of any number of a robot, in its unit: what is greater has never walked."""
+Number = Annotated[float, Ge(-MOST), Le(MOST)]
 OUR_MASS, OUR_LEVER = 15.2, 0.193
 """Of our own robot, kg and m."""
 
@@ -23,6 +25,8 @@ class Leg:
     straight. The foot is kept under the hip, in the plane that hip and knee move in.
     """
 
+    __pydantic_config__ = STRICT
+
     name: str
     left: bool
     front: bool
@@ -30,25 +34,25 @@ class Leg:
     """Abduction, hip and knee; the scene's servos have the same names."""
     foot: str
     """Sphere geom of the scene that touches the board."""
-    x: float
+    x: Number
     """Of the hip, and of the foot when it stands under it, m."""
-    y: float
+    y: Number
     """Of the foot, m."""
-    axis_height: float
+    axis_height: Number
     """z of the abduction's axis, m."""
-    drop: float
+    drop: Number
     """From there down to the hip, m."""
-    offset: float
+    offset: Number
     """From there to the left, to the plane of the foot, m."""
-    thigh: float
+    thigh: Number
     """Hip to knee, m."""
-    calf: float
+    calf: Number
     """Knee to the foot's centre, m."""
-    signs: tuple[float, float, float]
+    signs: tuple[Number, Number, Number]
     """Of abduction, hip and knee, +-1."""
-    zeros: tuple[float, float, float]
+    zeros: tuple[Number, Number, Number]
     """rad"""
-    knee: tuple[float, float]
+    knee: tuple[Number, Number]
     """Least and greatest turn of the calf against the thigh, rad; negative: the knee points
     backward."""
 
@@ -60,34 +64,36 @@ class Leg:
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """Measured on the compiled model by `measuring.measured`; legs in observation order."""
+    """Measured on the compiled model by `measure.measure`; legs in observation order."""
+
+    __pydantic_config__ = STRICT
 
     name: str
     """Its file's."""
-    legs: tuple[Leg, ...]
+    legs: Annotated[tuple[Leg, ...], Len(4, 4)]
     trunk: str
     """The body that is kept level, on a free joint."""
-    foot_radius: float
+    foot_radius: Number
     """m"""
-    trunk_mass: float
+    trunk_mass: Number
     """kg"""
-    total_mass: float
+    total_mass: Number
     """kg"""
-    hip_torque: float
+    hip_torque: Number
     """Limit of the abduction and hip servos, N m."""
-    knee_torque: float
+    knee_torque: Number
     """Limit of the knee servos, N m."""
-    servo_stiffness: float
+    servo_stiffness: Number
     """Position gain of the leg servos, N m / rad."""
-    servo_damping: float
+    servo_damping: Number
     """Damping of the leg joints, N m s / rad."""
-    servo_armature: float
+    servo_armature: Number
     """Inertia of rotor and gear at the joint, kg m^2."""
-    foot_friction: float
+    foot_friction: Number
     """Sliding friction of a foot on the board."""
-    body_height: float
+    body_height: Number
     """Standing height of the trunk's origin above the board, foot radius included, m."""
-    action_max: float
+    action_max: Number
     """Greatest height change of one decision on one axis, m."""
 
     @property
@@ -151,38 +157,6 @@ def robot_from_dict(values: Any) -> Robot:
     """Rebuilds a robot from the JSON values of `dataclasses.asdict`.
 
     Raises:
-      ValueError: if a field is missing, unknown or of another type.
+      InputError: if a field is missing, unknown or of another type.
     """
-    legs = values.get("legs") if isinstance(values, Mapping) else None
-    if not isinstance(legs, list) or len(legs) != 4:
-        raise ValueError("it must have four legs")
-    built = tuple(_record(Leg, leg) for leg in legs)
-    return _record(Robot, {**values, "legs": built})
-
-
-MOST = 1e7
-"""Of any number of a robot, in its unit: what is greater has never walked."""
-
-
-def _record(kind: type[T], values: Any) -> T:
-    hints = typing.get_type_hints(kind)
-    if not isinstance(values, Mapping) or set(values) != set(hints):
-        raise ValueError(f"a {kind.__name__.lower()} must have {', '.join(hints)}")
-    return kind(**{name: _value(name, hint, values[name]) for name, hint in hints.items()})
-
-
-def _value(name: str, hint: Any, value: Any) -> Any:
-    parts = typing.get_args(hint)
-    if parts and Ellipsis not in parts:
-        if not isinstance(value, list) or len(value) != len(parts):
-            raise ValueError(f"{name} must have {len(parts)} entries")
-        return tuple(_value(name, part, x) for part, x in zip(parts, value, strict=True))
-    kind = float if hint is float else hint
-    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        good = abs(value) <= MOST
-    else:
-        good = bool(parts) or type(value) is kind
-    if not good:
-        wanted = f"a sane number, within {MOST:g}" if hint is float else hint.__name__
-        raise ValueError(f"{name} must be {wanted}, not {value!s:.40}")
-    return value
+    return parse(Robot, values)

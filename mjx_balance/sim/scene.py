@@ -15,6 +15,7 @@ from mjx_balance.robots.build import (
     scene_dir,
 )
 from mjx_balance.robots.catalogue import Robot, find_robot, robot_file, robot_spec
+from mjx_balance.robots.limits import check_robot
 from mjx_balance.task import Array
 from mjx_balance.task.decision import Targets
 from mjx_balance.task.kinematics import joint_angles
@@ -162,9 +163,10 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     """Builds the model, looks its addresses up and settles the robot.
 
     Raises:
-      ConfigError: if the robot does not come to rest upright.
+      ConfigError: if the config contradicts its robot, or the robot does not come to rest upright.
     """
     robot = find_robot(config.robot)
+    check_robot(config, robot)
     model = build_model(config, visual)
     names = [[f"{ROBOT}{joint}" for joint in leg] for leg in robot.joints]
     leg_qpos = np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names])

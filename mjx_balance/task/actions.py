@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from mjx_balance.config import ConfigError, TaskConfig, shown
+from mjx_balance.config import ConfigError, TaskConfig
+from mjx_balance.files.text import quote
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
@@ -13,7 +14,7 @@ ACTIONS = ("discrete", "continuous")
 def check_action(kind: str) -> str:
     """Returns one of `ACTIONS`; raises `ConfigError` for anything else."""
     if kind not in ACTIONS:
-        raise ConfigError(f"action is {shown(kind)}; it must be one of {', '.join(ACTIONS)}")
+        raise ConfigError(f"action is {quote(kind)}; it must be one of {', '.join(ACTIONS)}")
     return kind
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from tensorboardX import SummaryWriter
 
-from mjx_balance.config import Config, ConfigError, combinations, members
+from mjx_balance.config import Config, ConfigError, expand_runs, sweep_grid
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.statistics import over_seeds
@@ -68,7 +68,7 @@ def export(
       PolicyError: if no seed has a policy.
     """
     policies, files = [], []
-    several = len(members(config)) > 1
+    several = len(expand_runs(config)) > 1
     for weights, manifest in exports(config, learner, scene_hash, state):
         manifest["training"]["seconds_learning_since_start_or_resume"] = round(seconds, 1)
         seed = manifest["config"]["seed"]
@@ -101,7 +101,7 @@ def finish(
 
     What says that the run is finished, `evaluation.json`, is written last.
     """
-    several = len(members(config)) > 1
+    several = len(expand_runs(config)) > 1
     scenarios, duration = config.eval_scenarios, config.eval_duration
     each = [
         _evaluate(policy, scenarios, duration, SEEDS.final, several, display) for policy in policies
@@ -183,7 +183,7 @@ def _ranked(config: Config, policies: list[Policy], each: list[Results]) -> list
     Fewer falls are better, then less mean tilt, added up over the suites.
     """
     rows = []
-    for number, values in enumerate(combinations(config)):
+    for number, values in enumerate(sweep_grid(config)):
         mine = [
             results
             for policy, results in zip(policies, each, strict=True)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from mjx_balance.config import Config, members
+from mjx_balance.config import Config, expand_runs
 from mjx_balance.dqn.learner import TrainState
 from mjx_balance.files.run_folder import RunFolder, keep_metrics_until, keep_validated_until
 from mjx_balance.report.progress import Display
@@ -70,7 +70,7 @@ def make_plan(config: Config) -> Plan:
     per_call = iterations * config.num_envs
     return Plan(
         num_envs=config.num_envs,
-        num_seeds=len(members(config)),
+        num_seeds=len(expand_runs(config)),
         iterations=iterations,
         total=-(-config.num_env_steps // per_call) * per_call,
         decision_s=config.task.ctrl_dt,

@@ -9,17 +9,24 @@ from typing import Any
 
 import jax
 
-from mjx_balance.config import Config, ConfigError, check, flatten, members, to_dict
+from mjx_balance.config import (
+    Config,
+    ConfigError,
+    check,
+    check_same_config,
+    expand_runs,
+    flatten,
+    read_run_config,
+    to_dict,
+)
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import (
     RunFolder,
     RunFolderError,
-    check_same_config,
     check_same_provenance,
     create_run_folder,
     locked,
-    read_run_config,
     write_json,
 )
 from mjx_balance.policy.file import Policy, PolicyError
@@ -161,7 +168,7 @@ def _open_folder(
     def open_it() -> str:
         if resume is None:
             name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-            made = create_run_folder(run_dir or Path("runs") / name, config, today)
+            made = create_run_folder(run_dir or Path("runs") / name, to_dict(config), today)
             return str(made.path.absolute())
         check_same_config(read_run_config(resume), config, resume)
         warning = check_same_provenance(resume, today)
@@ -177,7 +184,7 @@ def _open_folder(
             f"process {seen.index(False)} does not see {folder.path}; choose a folder that all "
             "machines share with --run-dir"
         )
-    last = config.seed + len(members(config)) - 1
+    last = config.seed + len(expand_runs(config)) - 1
     seeds = f"seed {last}" if last == config.seed else f"seeds {config.seed} to {last}"
     say(
         f"{folder.path}: preset {config.preset}, {seeds}, {config.num_envs} envs on "

@@ -15,10 +15,10 @@ from mjx_balance.config import (
     Config,
     ConfigError,
     check,
-    combinations,
+    expand_runs,
     flatten,
-    members,
     preset,
+    sweep_grid,
     to_dict,
 )
 from mjx_balance.dqn.learner import REPLICATED, Learner
@@ -194,8 +194,8 @@ def make_learner(config: Config, env: BalanceEnv) -> Learner:
     """The DQN for a config that `size_to_device` has completed."""
     assert config.num_envs is not None
     assert config.num_devices is not None
-    runs = members(config)
-    swept = combinations(config)[0]
+    runs = expand_runs(config)
+    swept = sweep_grid(config)[0]
     return Learner(
         env,
         QNetwork(config.dqn.hidden_sizes, network_factors(config), config.dqn.head == "radial"),

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_balance.config import Config, members
+from mjx_balance.config import Config, expand_runs
 from mjx_balance.dqn.learner import Learner, TrainState
 from mjx_balance.dqn.updating import Params
 from mjx_balance.evaluation.rollout import observing, run_suite, summarize
@@ -66,7 +66,7 @@ def exports(
         "device": jax.devices()[0].device_kind,
         "date": time.strftime("%Y-%m-%d"),
     }
-    runs = members(config)
+    runs = expand_runs(config)
     for k, own in enumerate(runs):
         mine = jax.tree.map(lambda x: x[k], known) if len(runs) > 1 else known  # noqa: B023
         yield jax.device_get(learner.exported(mine)), make_manifest(own, scene_hash, training)

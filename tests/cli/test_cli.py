@@ -143,7 +143,7 @@ def test_flags_start_from_the_preset_or_from_the_resumed_run(
     assert main(["train"]) == 0
     assert given[1][0] == preset("default")
     saved = dataclasses.replace(preset("best"), seed=9, num_env_steps=77)
-    create_run_folder(tmp_path / "run", saved, {})
+    create_run_folder(tmp_path / "run", to_dict(saved), {})
     assert main(["train", "--resume", "run"]) == 0
     assert given[2] == (saved, None, Path("run"))
     assert main(["train", "--resume", "run", "--run-dir", "b"]) == 2
@@ -153,7 +153,7 @@ def test_resuming_with_another_config_is_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
-    create_run_folder(folder, dataclasses.replace(preset("smoke"), num_devices=1), {})
+    create_run_folder(folder, to_dict(dataclasses.replace(preset("smoke"), num_devices=1)), {})
     said = refuse(capsys, "train", "--resume", "run", "--gamma", "0.9")
     assert "run was started with gamma = 0.1, not 0.9" in said
     said = refuse(capsys, "train", "--resume", "run", "--preset", "paper")
@@ -166,7 +166,7 @@ def test_resuming_in_another_scene_is_refused(
 ) -> None:
     provenance = {"scene_hash": "of another scene", "versions": {}}
     create_run_folder(
-        tmp_path / "run", dataclasses.replace(preset("smoke"), num_devices=1), provenance
+        tmp_path / "run", to_dict(dataclasses.replace(preset("smoke"), num_devices=1)), provenance
     )
     said = " ".join(refuse(capsys, "train", "--resume", "run").split())
     today = load_scene(preset("smoke")).hash
@@ -178,7 +178,7 @@ def test_resuming_a_run_at_work_is_refused(
 ) -> None:
     config = dataclasses.replace(preset("smoke"), num_devices=1)
     today = run.provenance(BalanceEnv(config))
-    folder = create_run_folder(tmp_path / "run", config, today)
+    folder = create_run_folder(tmp_path / "run", to_dict(config), today)
     with locked(folder):
         said = " ".join(refuse(capsys, "train", "--resume", "run").split())
     assert "another process works on the run in run;" in said

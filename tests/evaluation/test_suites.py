@@ -5,17 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_balance.config import Config, fitted, greatest_incline, preset
+from mjx_balance.config import Config, preset
 from mjx_balance.evaluation.suites import (
     SEEDS,
     SUITES,
     SuiteError,
-    authority,
     find_suite,
     make_pushes,
     make_scenarios,
 )
 from mjx_balance.robots.catalogue import Robot
+from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.task.randomization import DRAWS
 
 
@@ -160,11 +160,11 @@ def test_paper_fills_the_disc_and_corner_its_corners(config: Config) -> None:
 
 def test_authority_and_reach_by_hand(config: Config, robot: Robot) -> None:
     """15 mm/s over 193 mm, and 61 mm of leg over 335 mm."""
-    assert authority(config) == pytest.approx(np.degrees(0.015 / 0.193))
+    assert authority(config.task, robot) == pytest.approx(np.degrees(0.015 / 0.193))
     double = with_task(config, action_max=0.006)
-    assert authority(double) == pytest.approx(np.degrees(0.030 / 0.193))
+    assert authority(double.task, robot) == pytest.approx(np.degrees(0.030 / 0.193))
     slow = with_task(config, ctrl_dt=0.4)
-    assert authority(slow) == pytest.approx(np.degrees(0.0075 / 0.193))
+    assert authority(slow.task, robot) == pytest.approx(np.degrees(0.0075 / 0.193))
     reach = greatest_incline(config.task, robot)
     assert reach == pytest.approx(np.degrees(np.arctan(0.061 / 0.335)), abs=0.2)
 
@@ -206,7 +206,7 @@ def test_every_suite_follows_the_configs_incline(config: Config) -> None:
 
 def test_loads_and_kicks_go_with_the_robot() -> None:
     """B2 is 5.493 times as heavy as ours, and 1.702 times as long."""
-    config = fitted(preset("default"), "b2")
+    config = for_robot(preset("default"), "b2")
     _, conditions = make_scenarios(config, "payload", 200, 1.0, 0)
     assert conditions.payload.max() == pytest.approx(5 * 5.493, rel=0.03)
     assert np.abs(conditions.payload_at[:, :2]).max() == pytest.approx(0.05 * 1.702, rel=0.03)

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from fixtures import bodies
 
-from mjx_balance.config import check, fitted, preset
+from mjx_balance.config import check, preset
 from mjx_balance.robots.build import build, model_path, scene_dir
 from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, shipped
 from mjx_balance.robots.draft import draft
+from mjx_balance.robots.limits import for_robot
 from mjx_balance.robots.schema import parse_robot_file
 from mjx_balance.sim.scene import load_scene
 
@@ -129,7 +130,7 @@ def test_a_urdf(root: str, tmp_path: Path, robot: Robot) -> None:
     for leg, ours in zip(found.legs, robot.legs, strict=True):
         for field in ("x", "y", "thigh", "calf", "knee", "signs", "zeros"):
             assert getattr(leg, field) == pytest.approx(getattr(ours, field), abs=1e-9), field
-    load_scene(check(fitted(preset("default"), name)))
+    load_scene(check(for_robot(preset("default"), name)))
 
 
 def test_a_urdfs_trunk_is_its_root(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_everything_is_read(tmp_path: Path) -> None:
     assert (got.name, got.folder, got.model, got.trunk) == ("rex", tmp_path, "rex.xml", "torso")
     assert (got.imu, got.strip, got.knee_torque) == ((0.1, 0.0, -0.02), ("head",), 30.0)
     assert (got.source, got.hip_torque, got.foot_friction) == ("here", None, 0.8)
-    assert got.legs[0] == LegFile("A", ("a0", "a1", "a2"), Foot("a"), "left", "hind")
+    assert got.legs[0] == LegFile("A", ("a0", "a1", "a2"), "a", "left", "hind")
     assert got.legs[1] == LegFile("B", ("b0", "b1", "b2"), Foot("b", (0.0, 0.0, -0.2)))
     assert [leg.name for leg in got.legs] == ["A", "B", "C", "D"], "in the file's order"
 
@@ -55,28 +55,33 @@ def test_everything_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('trunk = "torso"', "", "trunk is None; it must be a name"),
+        ('trunk = "torso"', "", "trunk is missing"),
         ('"rex.xml"', "3", "model is 3; it must be a name"),
-        ("strip =", "stripe =", "the file has the unknown key 'stripe'; known keys: action_max"),
-        ("side =", "sight =", "leg A has the unknown key 'sight'"),
-        ('"left"', '"west"', "side of leg A is 'west'; it must be left or right"),
-        ('"hind"', '"back"', "end of leg A is 'back'; it must be front or hind"),
+        ("strip =", "stripe =", r"unknown field 'stripe' in RobotFile; did you mean strip\?"),
+        (
+            "strip =",
+            "colour =",
+            "unknown field 'colour' in RobotFile; it has name, folder, model, ",
+        ),
+        ("strip =", "folder =", "unknown field 'folder'"),
+        ("side =", "sid =", r"unknown field 'sid' of leg A in LegFile; did you mean side\?"),
+        ("side =", "name =", "unknown field 'name'"),
+        ('"left"', '"west"', "side of leg A is 'west'; it must be one of left, right"),
+        ('"hind"', '"back"', "end of leg A is 'back'; it must be one of front, hind"),
         ('"a0", "a1"', '"a0"', r"joints of leg A is \['a0', 'a2'\]; it must name three"),
         ('"c0"', '"b0"', "joint 'b0' is in leg B and in leg C"),
-        ("-0.2]", "]", r"foot of leg B is at \[0, 0\]; a place is three numbers"),
+        ("-0.2]", "]", r"foot of leg B is .*\[0, 0\]}; it must be a geom, site or body, or"),
         ('body = "b", ', "", "foot of leg B is {'offset'.*; it must be a geom, site or body"),
         ("[0.1, 0, -0.02]", "true", "imu is True; it must be a site, or a place"),
-        ("[0.1, 0, -0.02]", "[0.1, 0, nan]", r"imu is at \[0.1, 0, nan\]"),
+        ("[0.1, 0, -0.02]", "[0.1, 0, nan]", r"imu is \[0.1, 0, nan\]; it must be a site, or a"),
         ('["head"]', '"head"', "strip is 'head'; it must list bodies and joints"),
         ('["head"]', '["head", ""]', r"strip is \['head', ''\]; it must list bodies and joints"),
-        ("= 30", "= 0", "knee_torque is 0; it must be a number above 0"),
-        ("= 30", '= "30"', "knee_torque is '30'; it must be a number above 0"),
-        ("= 30", "= inf", "knee_torque is inf"),
-        (
-            "= 30",
-            "= 1" + 400 * "0",
-            r"knee_torque is 10+\.\.\.; it must be a number above 0, at mo",
-        ),
+        ("= 30", "= 0", "knee_torque is 0; it must be greater than 0"),
+        ("= 30", '= "30"', "knee_torque is '30'; it must be a finite number"),
+        ("= 30", "= inf", "knee_torque is inf; it must be a finite number"),
+        ("= 30", "= 2e7", "knee_torque is 20000000.0; it must be at most 10000000"),
+        ("= 30", "= 2020-01-01", r"knee_torque is datetime.date\(2020, 1, 1\); it must be a fin"),
+        ("= 30", "= 1" + 400 * "0", r"knee_torque is 10+\.\.\.; it must be a finite number"),
         ("= 30", "= 1" + 5000 * "0", "Exceeds the limit"),
         ("= 30", "= " + 3000 * "[", "nested too deep"),
         ('"here"', '["here"]', r"source is \['here'\]; it must be a text"),
@@ -91,9 +96,14 @@ def test_everything_is_read(tmp_path: Path) -> None:
         (
             'end = "hind"',
             'knee = "back"',
-            "knee of leg A is 'back'; it must be forward or backward",
+            "knee of leg A is 'back'; it must be one of forward, back",
         ),
-        ("[legs.D]", "[legs.A.more]", "legs has 3 entries; it must have four"),
+        ("[legs.D]", "[legs.A.more]", "unknown field 'more' of leg A"),
+        (
+            '\n[legs.D]\njoints = ["d0", "d1", "d2"]\nfoot = "d"',
+            "",
+            "legs is .*; it must be four t",
+        ),
         ('model = "rex.xml"', "model =", "Invalid value"),
     ],
 )

@@ -9,8 +9,9 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_balance.config import fitted, preset
+from mjx_balance.config import preset
 from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.robots.limits import for_robot
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "many_robots.py"
 ROBOTS = ("go1", "quadruped")
@@ -19,7 +20,7 @@ ROBOTS = ("go1", "quadruped")
 @pytest.fixture(scope="module")
 def fleet() -> Any:
     base = dataclasses.replace(preset("smoke"), engine="mujoco")
-    return runpy.run_path(str(EXAMPLE))["Fleet"]([fitted(base, x) for x in ROBOTS])
+    return runpy.run_path(str(EXAMPLE))["Fleet"]([for_robot(base, x) for x in ROBOTS])
 
 
 def test_each_robot_has_its_share_of_the_boards(fleet: Any) -> None:

@@ -7,8 +7,9 @@ import pytest
 from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 
-from mjx_balance.config import RandomizationConfig, fitted, preset
+from mjx_balance.config import RandomizationConfig, preset
 from mjx_balance.robots.catalogue import Robot
+from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.domain_randomization import model_fields
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.randomization import DRAWS, draw_conditions
@@ -19,7 +20,7 @@ WORST = RandomizationConfig(payload=8.0, payload_offset=0.1, friction_min=0.3, g
 @pytest.fixture(params=("quadruped", "go2"))
 def any_scene(request: pytest.FixtureRequest) -> Scene:
     """Go2's trunk has principal axes that are not its frame's."""
-    return load_scene(fitted(preset("default"), request.param))
+    return load_scene(for_robot(preset("default"), request.param))
 
 
 def test_inverse_weights_are_those_that_mujoco_computes(
@@ -44,7 +45,7 @@ def test_inverse_weights_are_those_that_mujoco_computes(
 
 def test_a_payload_by_full_tensors_in_the_trunks_own_axes() -> None:
     """Go2's: turned by a quarter about y, nearly; the products about its principal axes go."""
-    scene = load_scene(fitted(preset("default"), "go2"))
+    scene = load_scene(for_robot(preset("default"), "go2"))
     load = draw_conditions(WORST, scene.robot, np.full(DRAWS, 0.8))
     trunk = scene.model.body("robot/base")
     mass, added, at = trunk.mass[0], float(load.payload), load.payload_at

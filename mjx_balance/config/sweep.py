@@ -1,0 +1,66 @@
+"""A sweep: the runs that are trained side by side in one program."""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+
+from mjx_balance.config.schema import Config, ConfigError, DQNConfig
+from mjx_balance.files.text import quote
+
+SWEEPABLE = (
+    *("learning_rate", "learning_rate_end_share", "gamma", "huber_delta", "max_grad_norm"),
+    *("epsilon_start", "epsilon_end", "epsilon_decay_steps"),
+)
+"""Fields of `DQNConfig` that only enter into sums and products."""
+WHOLE = ("epsilon_decay_steps",)
+"""Those of them that are whole numbers."""
+
+
+def sweep_grid(config: Config) -> list[dict[str, float]]:
+    """Returns the combinations of a sweep's values, field -> value; one empty one without a sweep.
+
+    The last field varies fastest.
+
+    Raises:
+      ConfigError: for an entry that names no field of `SWEEPABLE`, or lists no numbers.
+    """
+    fields: dict[str, list[float]] = {}
+    for entry in config.sweep:
+        name, _, listed = entry.partition("=")
+        if name not in SWEEPABLE or name in fields:
+            raise ConfigError(
+                f"sweep is {quote(entry)}; it must name one of {', '.join(SWEEPABLE)}, each at "
+                "most once, and its values, as gamma=0.1,0.4"
+            )
+        try:
+            fields[name] = [float(value) for value in listed.split(",")]
+        except ValueError as error:
+            raise ConfigError(
+                f"sweep is {quote(entry)}; after {name}= it must list numbers, as 0.1,0.4"
+            ) from error
+    grid = itertools.product(*fields.values())
+    return [dict(zip(fields, values, strict=True)) for values in grid]
+
+
+def with_values(dqn: DQNConfig, values: Mapping[str, float]) -> DQNConfig:
+    """Returns the learner's config with one combination of `sweep_grid`."""
+    whole = {name: int(x) for name, x in values.items() if name in WHOLE and x.is_integer()}
+    return dataclasses.replace(dqn, **{**values, **whole})
+
+
+def expand_runs(config: Config) -> list[Config]:
+    """Returns the config of each run: every combination of the sweep with `num_seeds` seeds.
+
+    Seeds count on from run to run, so that no two runs have one name.
+    """
+    repeated = [x for x in sweep_grid(config) for _ in range(config.num_seeds)]
+    return [
+        dataclasses.replace(
+            config,
+            seed=config.seed + k,
+            num_seeds=1,
+            sweep=(),
+            dqn=with_values(config.dqn, values),
+        )
+        for k, values in enumerate(repeated)
+    ]

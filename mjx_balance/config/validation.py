@@ -1,0 +1,113 @@
+"""Whether a config can be run, whatever its robot."""
+
+from typing import Any
+
+from mjx_balance.config.presets import preset
+from mjx_balance.config.schema import Config, ConfigError, RandomizationConfig, TaskConfig
+from mjx_balance.config.sweep import sweep_grid, with_values
+from mjx_balance.files.text import quote
+from mjx_balance.files.validation import check_types
+
+MOST_STEPS = 10_000
+"""Physics steps of a decision."""
+
+
+def check(config: Config) -> Config:
+    """Returns `config` if it can be run with a robot that it suits (`robots.limits.check_robot`).
+
+    Raises:
+      ConfigError: one sentence that names the first field that is wrong, its value and a remedy.
+    """
+    if not isinstance(config, Config):
+        raise ConfigError(
+            f"config is {quote(config)}; it must be a Config, as `preset` and `for_robot` return"
+        )
+    _check_fields(config.task, config.randomization, config.dqn, config)
+    preset(config.preset)
+    _check_runs(config)
+    _check_timing(config.task)
+    _check_learning(config)
+    _check_randomization(config.randomization, config.task)
+    if config.export == "best" and not config.eval_every:
+        raise ConfigError(
+            "export is 'best', but eval_every is 0, so that nothing is validated to choose from; "
+            "eval_every must be at least 1, or export last"
+        )
+    return config
+
+
+def _check_fields(*sections: Any) -> None:
+    for section in sections:
+        check_types(section, ConfigError)
+
+
+def _check_runs(config: Config) -> None:
+    grid = sweep_grid(config)
+    for values in grid:
+        _check_fields(with_values(config.dqn, values))
+    runs = len(grid) * config.num_seeds
+    if config.sweep and runs == 1:
+        raise ConfigError(
+            f"sweep is {quote(config.sweep)}, which is one run; give it more values, or set "
+            "num_seeds to 2 or more"
+        )
+    if config.seed + runs > 2**31:
+        raise ConfigError(f"seed is {config.seed}; the last of all seeds must be less than 2**31")
+
+
+def _check_timing(task: TaskConfig) -> None:
+    steps = task.ctrl_dt / task.sim_dt
+    if not 0.5 < steps < MOST_STEPS + 0.5 or abs(steps - round(steps)) > 1e-6:
+        raise ConfigError(
+            f"ctrl_dt is {task.ctrl_dt} s; it must be a whole multiple of sim_dt, {task.sim_dt} s, "
+            f"at most {MOST_STEPS} times as long"
+        )
+    if task.action_levels % 2 == 0:
+        raise ConfigError(
+            f"action_levels is {task.action_levels}; it must be odd, so that standing still is an "
+            "action"
+        )
+    ramp = 2 * task.max_incline / task.board_rate
+    if ramp > task.target_period:
+        raise ConfigError(
+            f"target_period is {task.target_period} s, but a board ramp may last twice the "
+            f"greatest incline over board_rate, {ramp:g} s; the period must not be shorter"
+        )
+
+
+def _check_learning(config: Config) -> None:
+    dqn, num_envs = config.dqn, config.num_envs
+    if dqn.min_replay_size > dqn.replay_capacity:
+        raise ConfigError(
+            f"min_replay_size is {dqn.min_replay_size}; it must not exceed replay_capacity, "
+            f"{dqn.replay_capacity}"
+        )
+    if num_envs is None:
+        return
+    if dqn.replay_capacity < num_envs:
+        raise ConfigError(
+            f"replay_capacity is {dqn.replay_capacity}; it must hold at least one decision of "
+            f"all num_envs = {num_envs} envs"
+        )
+    updates = dqn.replay_ratio * num_envs / dqn.batch_size
+    if not 0.5 < updates < 2**31 or abs(updates - round(updates)) > 1e-6:
+        raise ConfigError(
+            f"replay_ratio is {dqn.replay_ratio:g}: with num_envs {num_envs} and batch_size "
+            f"{dqn.batch_size} that makes {updates:g} gradient steps after each decision of "
+            "all envs; it must be a whole number of them"
+        )
+
+
+def _check_randomization(ranges: RandomizationConfig, task: TaskConfig) -> None:
+    least, most = ranges.friction_min, ranges.friction_max
+    if least is not None and most is not None and most < least:
+        raise ConfigError(f"friction_max is {most}; it must not be less than friction_min, {least}")
+    if ranges.push_max < ranges.push_min:
+        raise ConfigError(
+            f"push_max is {ranges.push_max}; it must not be less than push_min, {ranges.push_min}"
+        )
+    if ranges.push_max and ranges.push_period < task.ctrl_dt:
+        raise ConfigError(
+            f"push_period is {ranges.push_period} s; it must not be shorter than ctrl_dt, "
+            f"{task.ctrl_dt} s"
+        )

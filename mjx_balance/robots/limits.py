@@ -1,0 +1,93 @@
+"""Where config and robot meet: a config made for a robot, and whether it suits it."""
+
+import dataclasses
+import math
+
+from mjx_balance.config import Config, ConfigError, RandomizationConfig, TaskConfig
+from mjx_balance.robots.catalogue import find_robot
+from mjx_balance.robots.robot import Robot
+
+
+def for_robot(config: Config, robot: str) -> Config:
+    """Returns `config`, of our own robot, made for another one.
+
+    Standing height and greatest height change are the robot's own (`robots.measure`), loads follow
+    its mass and size. Angles, the board's rate and the fall limit stay the paper's. To replace
+    `robot` alone leaves the robot with the height, the height changes and the loads of another.
+
+    Args:
+      config: of our own robot.
+      robot: as `Config.robot`.
+
+    Raises:
+      ConfigError: if there is no such robot.
+    """
+    own = find_robot(robot)
+    task = dataclasses.replace(
+        config.task,
+        body_height=own.body_height,
+        action_max=own.action_max,
+        height_scale=config.task.height_scale * own.size_scale,
+    )
+    ranges = scale_ranges(config.randomization, own)
+    return dataclasses.replace(config, robot=robot, task=task, randomization=ranges)
+
+
+def scale_ranges(ranges: RandomizationConfig, robot: Robot) -> RandomizationConfig:
+    """Scales loads by the robot's mass, their places and the speeds of pushes by its size."""
+    return dataclasses.replace(
+        ranges,
+        payload=ranges.payload * robot.mass_scale,
+        payload_offset=ranges.payload_offset * robot.size_scale,
+        payload_height=ranges.payload_height * robot.size_scale,
+        push_min=ranges.push_min * robot.size_scale,
+        push_max=ranges.push_max * robot.size_scale,
+    )
+
+
+def greatest_incline(task: TaskConfig, robot: Robot) -> float:
+    """Board angle on both axes at once that the legs' stroke can follow, deg."""
+    lowest, highest = robot.height_range
+    room = min(highest - task.body_height, task.body_height - lowest)
+    return math.degrees(math.atan(room / (robot.half_length + robot.half_track)))
+
+
+def authority(task: TaskConfig, robot: Robot) -> float:
+    """Greatest board speed that the action set can follow on both axes, deg/s.
+
+    `action_max` per decision over the longer of the two half-tracks, fore-aft.
+    """
+    return math.degrees(task.action_max / task.ctrl_dt / robot.lever)
+
+
+def check_robot(config: Config, robot: Robot) -> Config:
+    """Returns `config`, which `config.check` has passed, if the robot can do what it asks for.
+
+    Raises:
+      ConfigError: one sentence that names the field, its value and the robot.
+    """
+    task, ranges = config.task, config.randomization
+    lowest, highest = robot.height_range
+    limit = greatest_incline(task, robot)
+    if limit <= 0:
+        raise ConfigError(
+            f"body_height is {task.body_height} m; the legs of robot {robot.name} reach from "
+            f"{lowest:.3f} to {highest:.3f} m"
+        )
+    if task.max_incline > limit:
+        raise ConfigError(
+            f"max_incline is {task.max_incline} deg; on both axes at once the legs of robot "
+            f"{robot.name}, from body_height {task.body_height} m, reach at most {limit:.1f} deg"
+        )
+    own = robot.foot_friction
+    if ranges.friction_min is None and (ranges.friction_max or own) < own:
+        raise ConfigError(
+            f"friction_max is {ranges.friction_max}; it must not be less than the friction of "
+            f"robot {robot.name}, {own}, unless friction_min is given"
+        )
+    if ranges.friction_max is None and (ranges.friction_min or own) > own:
+        raise ConfigError(
+            f"friction_min is {ranges.friction_min}; it must not exceed the friction of robot "
+            f"{robot.name}, {own}, unless friction_max is given"
+        )
+    return config
