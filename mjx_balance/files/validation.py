@@ -69,7 +69,7 @@ def check_types(value: T, error: type[InputError] = InputError) -> T:
     try:
         _adapter(type(value)).validate_python(value)
     except ValueError as broken:
-        raise error(_sentence(broken, type(value), value, {})) from broken
+        raise error(_sentence(broken, type(value), value)) from broken
     return value
 
 
@@ -78,6 +78,7 @@ def parse(
     values: Any,
     error: type[InputError] = InputError,
     remedies: Mapping[str, str] | None = None,
+    name: str = "",
 ) -> T:
     """Builds a dataclass, or a value of another type, from JSON values.
 
@@ -86,25 +87,28 @@ def parse(
       values: as `json.loads` or `tomllib.loads` return them.
       error: class to raise.
       remedies: field -> what it must do, where a sentence of its own says it better.
+      name: of the values as a whole; the type's if none.
 
     Raises:
       InputError: as `check_types`.
     """
     try:
-        return _adapter(kind).validate_json(json.dumps(values, default=str))
+        return _adapter(kind).validate_json(json.dumps(values, default=str), strict=True)
     except (TypeError, RecursionError) as broken:
         raise error(f"{quote(values)} cannot be written as JSON") from broken
     except ValueError as broken:
         if not hasattr(broken, "errors"):  # an int of too many digits
             raise error(f"{quote(values)} cannot be written as JSON") from broken
-        raise error(_sentence(broken, kind, values, remedies or {})) from broken
+        raise error(_sentence(broken, kind, values, remedies, name)) from broken
 
 
-def _sentence(error: Any, kind: Any, value: Any, remedies: Mapping[str, str]) -> str:
+def _sentence(
+    error: Any, kind: Any, value: Any, remedies: Mapping[str, str] | None = None, name: str = ""
+) -> str:
     """Field, value and what would be right, of the first of pydantic's errors."""
     first = error.errors(include_url=False)[0]
     code, path, given = first["type"], first["loc"], first["input"]
-    name, owner, subject = error.title, "", "it"
+    name, owner, subject = name or error.title, "", "it"
     for k, place in enumerate(path):
         child = _child(value, place)
         title = _child(child, "name")
@@ -116,6 +120,8 @@ def _sentence(error: Any, kind: Any, value: Any, remedies: Mapping[str, str]) ->
             name, value = place, child
         elif isinstance(title, str):
             owner, value = f" of {name.removesuffix('s')} {shorten(title)}", child
+        elif any(isinstance(x, str) for x in path[k:]):
+            owner, value = f" of {name}[{place}]", child
         else:
             subject = "each entry"
             break
@@ -126,7 +132,7 @@ def _sentence(error: Any, kind: Any, value: Any, remedies: Mapping[str, str]) ->
     if code == "literal_error":
         context = {"expected": ", ".join(re.findall("'([^']*)'", context["expected"]))}
     complaint = f"{name}{owner} is {quote(value)}"
-    if name in remedies:
+    if remedies and name in remedies:
         return f"{complaint}; it must {remedies[name]}"
     if code not in REMEDIES:
         return f"{complaint}: {shorten(first['msg'], MESSAGE)}"

@@ -5,9 +5,10 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Len
 
 from mjx_balance.config import to_dict
 from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_controller
@@ -22,15 +23,13 @@ from mjx_balance.evaluation.rollout import (
 )
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import read_json
+from mjx_balance.files.validation import parse
 from mjx_balance.policy.file import Policy
 from mjx_balance.report.digest import code_digest
 from mjx_balance.report.reading import (
     FOREIGN,
+    Finite,
     ReportError,
-    count,
-    number,
-    section,
-    series,
     suite_result,
 )
 from mjx_balance.sim.scene import Scene
@@ -43,6 +42,7 @@ RECORD_SECONDS = 100.0
 VIDEO_SECONDS = 12.0
 BINS = 161
 """Of the tilt distribution."""
+_Shares = dict[str, dict[str, Annotated[list[Finite], Len(BINS, BINS)]]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,44 +93,23 @@ def kept(saved: dict[str, Any]) -> Measured:
       ReportError: for a value that was not measured.
       KeyError: for one that is missing.
     """
+    shares = parse(_Shares, saved["shares"], ReportError)
+    mapped = parse(Envelope, saved["envelope"], ReportError)
+    numbers = (*mapped.inclines, *mapped.rates, mapped.authority, mapped.reach, mapped.duration_s)
+    for grid in (mapped.fall_rate, mapped.mean_tilt):
+        if np.shape(grid) != (len(mapped.inclines), len(mapped.rates)):
+            raise ReportError("a grid has another shape than its inclines and rates")
+    if not np.isfinite([*numbers, *np.ravel(mapped.fall_rate), *np.ravel(mapped.mean_tilt)]).all():
+        raise ReportError("the envelope holds values that are not finite")
     names = ("policy", *CONTROLLERS)
-    mapped = section(saved["envelope"])
-    inclines, rates = (_numbers(mapped[name], None) for name in ("inclines", "rates"))
     return Measured(
         results={
             name: {suite: suite_result(saved["results"][name][suite], suite) for suite in HEADLINE}
             for name in names
         },
-        shares={
-            name: {suite: _numbers(saved["shares"][name][suite], BINS) for suite in HEADLINE}
-            for name in names
-        },
-        envelope=Envelope(
-            inclines=inclines,
-            rates=rates,
-            fall_rate=_grid(mapped["fall_rate"], len(inclines), len(rates)),
-            mean_tilt=_grid(mapped["mean_tilt"], len(inclines), len(rates)),
-            authority=number(mapped["authority"], "authority"),
-            reach=number(mapped["reach"], "reach"),
-            scenarios=count(mapped["scenarios"], "scenarios"),
-            duration_s=number(mapped["duration_s"], "duration_s"),
-            seed=count(mapped["seed"], "seed"),
-        ),
+        shares={name: {suite: shares[name][suite] for suite in HEADLINE} for name in names},
+        envelope=mapped,
     )
-
-
-def _numbers(values: Any, size: int | None) -> list[float]:
-    found = [number(value, "a value") for value in series(values, "a row")]
-    if len(found) != (len(found) if size is None else size):
-        raise ReportError(f"a row holds {len(found)} values, not {size}")
-    return found
-
-
-def _grid(values: Any, rows: int, columns: int) -> list[list[float]]:
-    found = [_numbers(row, columns) for row in series(values, "a grid")]
-    if len(found) != rows:
-        raise ReportError(f"a grid holds {len(found)} rows, not {rows}")
-    return found
 
 
 def _measure(

@@ -1,19 +1,21 @@
 """What can be read of a run folder, whole or not, damaged or foreign.
 
-Every value that the report uses is checked here, and nothing else of a file is kept.
+Every value that the report uses is checked here; nothing else of a file is read.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from reprlib import repr as short
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Ge, Le, MaxLen
 
 from mjx_balance.config import Config, read_config
 from mjx_balance.errors import InputError
-from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder, parse_json, read_json
+from mjx_balance.files.text import MESSAGE, quote, shorten
+from mjx_balance.files.validation import STRICT, parse
 from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report.figures import CURVES, HELD_OUT
 
@@ -24,8 +26,6 @@ LINE_BYTES = 2**18
 MOST_SEEDS = 1000
 GREATEST = 1e15
 """No number of a run is greater; up to here doubles hold whole numbers."""
-SENTENCE = 300
-"""Longest reason that is shown, characters."""
 FOREIGN = (
     *(ValueError, TypeError, KeyError, AttributeError),
     *(OverflowError, RecursionError, MemoryError, OSError),
@@ -91,78 +91,89 @@ def read_run(path: Path) -> Run:
 
 
 def why(error: BaseException) -> str:
-    """The reason that an error gives: one short line, with nothing that moves a cursor."""
+    """The reason that an error gives, in one short line."""
     reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-    cut = len(reason) > SENTENCE
-    reason = " ".join(reason[:SENTENCE].split()) or type(error).__name__
-    reason = "".join(letter if letter.isprintable() else "?" for letter in reason)
-    return f"{reason} ..." if cut else reason
+    return shorten(reason, MESSAGE) or type(error).__name__
 
 
-def section(value: Any, name: str = "it") -> dict[str, Any]:
-    """Returns a JSON object; raises `ReportError` for anything else."""
-    if not isinstance(value, dict):
-        raise ReportError(f"{name} is {short(value)}; it must be a JSON object")
-    return value
+LENIENT = STRICT | {"extra": "ignore"}
+Finite = Annotated[float, Ge(-GREATEST), Le(GREATEST)]
+Count = Annotated[int, Ge(0), Le(GREATEST)]
 
 
-def series(value: Any, name: str) -> list[Any]:
-    """Returns a list; raises `ReportError` for anything else."""
-    if not isinstance(value, list):
-        raise ReportError(f"{name} is {short(value)}; it must be a list")
-    return value
+@dataclasses.dataclass(frozen=True)
+class Tilt:
+    """Of the body over all physics steps, deg."""
+
+    __pydantic_config__ = LENIENT
+
+    mean: Finite
+    p95: Finite
+    max: Finite
 
 
-def number(value: Any, name: str) -> float:
-    """Returns a finite number; raises `ReportError` for anything else."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ReportError(f"{name} is {short(value)}; it must be a number")
-    if not abs(value) <= GREATEST:
-        raise ReportError(f"{name} is {short(value)}; it must be finite and at most {GREATEST:g}")
-    return float(value)
+@dataclasses.dataclass(frozen=True)
+class SuiteResult:
+    """What a report shows of the JSON of `evaluation.summarize`."""
+
+    __pydantic_config__ = LENIENT
+
+    scenarios: Count
+    falls: Count
+    tilt_deg: Tilt
+    action_mm_settled: Finite | None = None
 
 
-def count(value: Any, name: str) -> int:
-    """Returns a whole number; raises `ReportError` for anything else."""
-    if type(value) is not int or not 0 <= value <= GREATEST:
-        raise ReportError(f"{name} is {short(value)}; it must be a whole number of at least 0")
-    return value
+@dataclasses.dataclass(frozen=True)
+class _Seed:
+    __pydantic_config__ = LENIENT
+
+    evaluation: dict[str, SuiteResult]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Seeds:
+    __pydantic_config__ = LENIENT
+
+    seeds: Annotated[list[_Seed], MaxLen(MOST_SEEDS)]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Line:
+    env_steps: Count
+    metrics: dict[str, Finite]
+    seeds: dict[str, list[Finite | None]]
 
 
 def suite_results(value: Any) -> dict[str, dict[str, Any]]:
     """Checks an evaluation: suite -> JSON of `evaluation.summarize`."""
-    return {suite: suite_result(result, suite) for suite, result in section(value).items()}
+    results = parse(dict[str, SuiteResult], value, ReportError, name="it")
+    return {suite: _as_dict(result) for suite, result in results.items()}
 
 
 def suite_result(value: Any, suite: str) -> dict[str, Any]:
     """Takes from the JSON of `evaluation.summarize` what a report shows.
 
     Returns:
-      scenarios, falls, tilt_deg {mean, p95, max}, and action_mm_settled or none.
+      The fields of `SuiteResult`.
 
     Raises:
       ReportError: for values that no evaluation gives.
-      KeyError: for a value that is missing.
     """
-    result = section(value, suite)
-    scenarios, falls = (count(result[name], name) for name in ("scenarios", "falls"))
-    if falls > scenarios:
-        raise ReportError(f"falls is {falls}; it must not exceed scenarios, {scenarios}")
-    tilt = section(result["tilt_deg"], "tilt_deg")
-    settled = result.get("action_mm_settled")
-    return {
-        "scenarios": scenarios,
-        "falls": falls,
-        "tilt_deg": {name: number(tilt[name], name) for name in TILTS},
-        "action_mm_settled": None if settled is None else number(settled, "action_mm_settled"),
-    }
+    return suite_results({suite: value})[suite]
+
+
+def _as_dict(result: SuiteResult) -> dict[str, Any]:
+    if result.falls > result.scenarios:
+        raise ReportError(
+            f"falls is {result.falls}; it must not exceed scenarios, {result.scenarios}"
+        )
+    return dataclasses.asdict(result)
 
 
 def _read_seeds(file: Path) -> list[dict[str, dict[str, Any]]]:
-    rows = series(section(read_json(file))["seeds"], "seeds")
-    if len(rows) > MOST_SEEDS:
-        raise ReportError(f"it holds {len(rows)} seeds; at most {MOST_SEEDS} are read")
-    return [suite_results(section(row, "a seed")["evaluation"]) for row in rows]
+    rows = parse(_Seeds, read_json(file), ReportError, name="it").seeds
+    return [{suite: _as_dict(x) for suite, x in row.evaluation.items()} for row in rows]
 
 
 def _read_metrics(file: Path, missing: list[str]) -> list[dict[str, Any]]:
@@ -193,28 +204,36 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
     """What the learning curves need of a line that follows those `before` it."""
     if len(text) > LINE_BYTES:
         raise ReportError(f"it is longer than {LINE_BYTES:,} bytes")
-    found = section(parse_json(text))
-    line: dict[str, Any] = {"env_steps": count(found["env_steps"], "env_steps")}
-    if before and line["env_steps"] <= before[-1]["env_steps"]:
-        raise ReportError(
-            f"env_steps is {line['env_steps']}; it must be more than in the line before"
-        )
-    found.setdefault("train/loss", math.nan)  # before the first update there is none
-    line |= {name: _logged(found[name], name) for name, _, _ in CURVES}
-    line |= {name: _logged(found[name], name) for name in HELD_OUT if name in found}
-    seeds = section(found.get("seeds", {}), "seeds")
+    values = parse_json(text)
+    seeds = values.get("seeds", {}) if isinstance(values, dict) else None
+    if not isinstance(seeds, dict):
+        raise ReportError(f"it is {quote(values)}; it must map metrics to values")
+    values.setdefault("train/loss", math.nan)  # before the first update there is none
+    curves = [name for name, _, _ in CURVES]
+    names = (*curves, *(name for name in HELD_OUT if name in values))
+    of_seeds = (*(name.removeprefix("train/") for name in curves), *HELD_OUT)
+    line = parse(
+        _Line,
+        {
+            "env_steps": values.get("env_steps"),
+            "metrics": {x: values.get(x) for x in names if not _is_gap(values.get(x))},
+            "seeds": {x: _without_gaps(seeds[x]) for x in of_seeds if x in seeds},
+        },
+        ReportError,
+    )
+    if before and line.env_steps <= before[-1]["env_steps"]:
+        raise ReportError(f"env_steps is {line.env_steps}; it must be more than in the line before")
+    metrics = {name: line.metrics.get(name, math.nan) for name in names}
+    found: dict[str, Any] = {"env_steps": line.env_steps, **metrics}
     if seeds:
-        short = [name.removeprefix("train/") for name, _, _ in CURVES]
-        line["seeds"] = {
-            name: [_logged(math.nan if x is None else x, name) for x in series(seeds[name], name)]
-            for name in (*short, *HELD_OUT)
-            if name in seeds
+        found["seeds"] = {
+            name: [math.nan if x is None else x for x in row] for name, row in line.seeds.items()
         }
-    if 0 in _counts(line).values():
+    if 0 in _counts(found).values():
         raise ReportError("it holds no seed")
-    if before and _counts(line) != _counts(before[0]):
+    if before and _counts(found) != _counts(before[0]):
         raise ReportError("other seeds than in line 1")
-    return line
+    return found
 
 
 def _counts(line: dict[str, Any]) -> dict[str, int]:
@@ -223,8 +242,10 @@ def _counts(line: dict[str, Any]) -> dict[str, int]:
     return {name: len(values) for name, values in seeds.items() if name not in HELD_OUT}
 
 
-def _logged(value: Any, name: str) -> float:
-    """A metric; where there was none, or a training diverged, there is a gap."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return math.nan
-    return number(value, name)
+def _is_gap(value: Any) -> bool:
+    """Whether a training diverged here."""
+    return isinstance(value, float) and not math.isfinite(value)
+
+
+def _without_gaps(row: Any) -> Any:
+    return [None if _is_gap(x) else x for x in row] if isinstance(row, list) else row

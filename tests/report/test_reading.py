@@ -43,28 +43,44 @@ def good(metrics_line: Any, evaluations: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("config.json", "[]", "config.json cannot be used: it is []; it must be a JSON"),
-        ("config.json", '{"task": []}', "config.json cannot be used: TaskConfig is []"),
+        ("config.json", "[]", "config.json cannot be used: Config is []; it must map"),
+        ("config.json", '{"task": []}', "config.json cannot be used: task is []; it must map"),
         ("config.json", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a finite number"),
         ("metrics.jsonl", 'GOOD\n{"env_st', "metrics.jsonl is shown up to line 2"),
-        ("metrics.jsonl", 'GOOD\n{"env_steps": 9999}', "it has no 'train/tilt_deg'"),
+        (
+            "metrics.jsonl",
+            'GOOD\n{"env_steps": 9999}',
+            "train/tilt_deg is None; it must",
+        ),
         ("metrics.jsonl", "GOOD\n5", "metrics.jsonl is shown up to line 2"),
         (
             "metrics.jsonl",
             "GOOD\nGOOD",
             "line 2, which cannot be used: env_steps is 1",
         ),
-        ("seeds.json", '{"best": 1}', "seeds.json cannot be used: it has no 'seeds'"),
-        ("seeds.json", "[1]", "seeds.json cannot be used: it is [1]; it must be a JSON object"),
+        ("seeds.json", '{"best": 1}', "seeds.json cannot be used: seeds is missing"),
+        ("seeds.json", "[1]", "seeds.json cannot be used: it is [1]; it must map its fields"),
         ("seeds.json", '{"seeds": {}}', "seeds is {}; it must be a list"),
-        ("seeds.json", f'{{"seeds": [{", ".join(["1"] * 1001)}]}}', "it holds 1001 seeds"),
-        ("evaluation.json", '{"paper": {"falls": 0}}', "evaluation.json cannot be used: it has no"),
-        ("evaluation.json", '{"paper": 1}', "paper is 1; it must be a JSON object"),
+        (
+            "seeds.json",
+            f'{{"seeds": [{", ".join(["{}"] * 1001)}]}}',
+            "length of at most 1000",
+        ),
+        (
+            "evaluation.json",
+            '{"paper": {"falls": 0}}',
+            "evaluation.json cannot be used: scenarios is ",
+        ),
+        ("evaluation.json", '{"paper": 1}', "paper is 1; it must map its fields to values"),
         ("evaluation.json", "[" * 100_000, "evaluation.json cannot be used: it is nested too deep"),
         ("evaluation.json", "9" * 5_000, "evaluation.json cannot be used: it is no JSON: Exceeds"),
         ("evaluation.json", " " * (2**21 + 1), "it is 2.0 MiB long; at most 1 MiB are read"),
         ("evaluation.json", b"\xff\xfe\x00{", "evaluation.json cannot be used: it is no JSON"),
-        ("evaluation.json", '{"\\u001b[2J\\ud800": 1}', "cannot be used: ?[2J? is 1; it must"),
+        (
+            "evaluation.json",
+            '{"\\u001b[2J\\ud800": 1}',
+            "cannot be used: it is {'\\x1b[2J\\ud800'",
+        ),
         (
             "metrics.jsonl",
             "GOOD\n" + " " * 2**19,
@@ -102,10 +118,10 @@ HUGE = 10**400
     ("where", "value", "said"),
     [
         ("falls", HOSTILE, "falls is '<img"),
-        ("falls", "1", "falls is '1'; it must be a whole number of at least 0"),
+        ("falls", "1", "falls is '1'; it must be a whole number"),
         ("falls", True, "falls is True; it must be a whole number"),
         ("falls", 1.5, "falls is 1.5; it must be a whole number"),
-        ("falls", -1, "falls is -1; it must be a whole number of at least 0"),
+        ("falls", -1, "falls is -1; it must be at least 0"),
         ("falls", HUGE, "falls is 10000"),
         ("falls", 9, "falls is 9; it must not exceed scenarios, 8"),
         ("scenarios", [8], "scenarios is [8]; it must be a whole number"),
@@ -113,9 +129,9 @@ HUGE = 10**400
         ("scenarios", HOSTILE, "scenarios is '<img"),
         ("tilt_deg", HOSTILE, "tilt_deg is '<img"),
         ("mean", HOSTILE, "mean is '<img"),
-        ("mean", False, "mean is False; it must be a number"),
-        ("p95", float("nan"), "p95 is nan; it must be finite"),
-        ("max", float("inf"), "max is inf; it must be finite"),
+        ("mean", False, "mean is False; it must be a finite number"),
+        ("p95", float("nan"), "p95 is nan; it must be a finite number"),
+        ("max", float("inf"), "max is inf; it must be a finite number"),
         ("max", HUGE, "max is 1000"),
         ("max", None, "max is None"),
     ],
@@ -136,7 +152,7 @@ def test_results_are_numbers(
         run = reading.read_run(folder)
         assert run.results == []
         sentences = [sentence for sentence in run.missing if f"{name} cannot be used" in sentence]
-        assert said in sentences[0]
+        assert said in sentences[0].replace(" of seeds[0]", "")
 
 
 @pytest.mark.parametrize(
