@@ -222,7 +222,10 @@ def weight(name: str, value: Any) -> Edit:
         (lambda w, m: m["config"]["task"].update(action_levels=100_001), "action_levels is 100001"),
         (lambda w, m: m["config"]["task"].update(ctrl_dt=0.0), r"ctrl_dt is 0\.0"),
         (lambda w, m: m["config"].update(wings=2), "unknown field 'wings'"),
-        (lambda w, m: m["robot"].update(wings=2), "its robot cannot be used: unknown field 'wings' in"),
+        (
+            lambda w, m: m["robot"].update(wings=2),
+            "its robot cannot be used: unknown field 'wings' in",
+        ),
         (lambda w, m: m["robot"]["legs"].pop(), "its robot .* legs is .*; .* length of at least 4"),
         (leg(thigh="long"), "thigh of leg .. is 'long'; it must be a finite number"),
         (leg(calf=math.nan), "calf of leg .. is nan; it must be a finite number"),
