@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.files.text import quote
-from mjx_balance.robots.measure import Pose, check_joints, measured
+from mjx_balance.robots.measure import Pose, check_joints, measure
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import Foot, RobotError, RobotFile
 
@@ -143,7 +143,7 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     check_joints(bare, file)
     if _align(spec, trunk, bare, file):
         bare = _compiled(spec)
-    robot = measured(file, bare, names, radius)
+    robot = measure(file, bare, names, radius)
     _equip(spec, robot, _imu(spec, trunk, bare, file))
     if file.board_size is not None:
         spec.add_numeric(name=BOARD_SIZE, data=[file.board_size])

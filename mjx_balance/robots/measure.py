@@ -1,7 +1,9 @@
-"""A robot's numbers, found on its compiled model; what depends on its size follows from them."""
+"""A robot's numbers, measured on its compiled model; what depends on its size follows from them."""
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import mujoco
@@ -11,6 +13,7 @@ from mjx_balance.files.validation import check_types
 from mjx_balance.robots.robot import (
     OUR_LEVER,
     OUR_MASS,
+    Body,
     Leg,
     Robot,
 )
@@ -31,8 +34,8 @@ INCLINE = 7.0
 """On both axes at once, deg, that the legs must be able to follow (paper 3.1)."""
 
 
-def measured(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: float) -> Robot:
-    """Measures a robot, and sizes what its file does not say.
+def measure(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: float) -> Robot:
+    """Measures a robot, and sizes what its file leaves out.
 
     Args:
       file: what is known of it.
@@ -47,41 +50,33 @@ def measured(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: fl
     _check_corners(file, legs)
     _check_bends(file, legs)
     trunk = model.body(file.trunk)
-    mass = _clean(trunk.subtreemass[0])
-    hips = [joint for leg in legs for joint in leg.joints[:2]]
-    hip_torque = file.hip_torque or min(_torque(model, x) for x in hips)
-    knee_torque = file.knee_torque or min(_torque(model, leg.joints[2]) for leg in legs)
-    robot = Robot(
+    body = Body(
         name=file.name,
         legs=legs,
         trunk=file.trunk,
         foot_radius=radius,
         trunk_mass=_clean(trunk.mass[0]),
-        total_mass=mass,
-        hip_torque=hip_torque,
-        knee_torque=knee_torque,
-        foot_friction=file.foot_friction,
-        # What follows takes their place.
-        servo_stiffness=0.0,
-        servo_damping=0.0,
-        servo_armature=0.0,
-        body_height=0.0,
-        action_max=0.0,
+        total_mass=_clean(trunk.subtreemass[0]),
     )
-    if min(robot.mass_scale, robot.size_scale) < SMALLEST:
+    if min(body.mass_scale, body.size_scale) < SMALLEST:
         raise RobotError(
-            f"it weighs {mass:.3g} kg and its feet are {robot.lever:.3g} m off its middle; at "
-            f"least {SMALLEST * OUR_MASS:.2g} kg and {SMALLEST * OUR_LEVER:.2g} m are needed for "
-            "a board of its size"
+            f"it weighs {body.total_mass:.3g} kg and its feet are {body.lever:.3g} m off its "
+            f"middle; at least {SMALLEST * OUR_MASS:.2g} kg and {SMALLEST * OUR_LEVER:.2g} m are "
+            "needed for a board of its size"
         )
-    sized = {"body_height": file.body_height or _body_height(robot)}
-    sized["action_max"] = _digits(OUR_ACTION * robot.lever / OUR_LEVER)
-    stiffer = _stiffer(robot, sized["body_height"])
-    sized["servo_stiffness"] = _digits(OUR_STIFFNESS * stiffer)
-    sized["servo_damping"] = _digits(OUR_DAMPING * stiffer)
-    sized["servo_armature"] = _digits(OUR_ARMATURE * stiffer)
-    said = {name: getattr(file, name) or value for name, value in sized.items()}
-    robot = dataclasses.replace(robot, **said)
+    height = file.body_height or _standing_height(body)
+    stiffer = _stiffer(body, height)
+    robot = Robot(
+        **vars(body),
+        hip_torque=file.hip_torque or _torque(model, [x for leg in legs for x in leg.joints[:2]]),
+        knee_torque=file.knee_torque or _torque(model, [leg.joints[2] for leg in legs]),
+        servo_stiffness=file.servo_stiffness or _digits(OUR_STIFFNESS * stiffer),
+        servo_damping=file.servo_damping or _digits(OUR_DAMPING * stiffer),
+        servo_armature=file.servo_armature or _digits(OUR_ARMATURE * stiffer),
+        foot_friction=file.foot_friction,
+        body_height=height,
+        action_max=file.action_max or _digits(OUR_ACTION * body.lever / OUR_LEVER),
+    )
     # A policy carries it: better refused now than when a training has ended.
     return check_types(robot, RobotError)
 
@@ -151,7 +146,7 @@ class Pose:
         return self.data.geom(geom).xpos.copy()
 
 
-def _body_height(robot: Robot) -> float:
+def _standing_height(robot: Body) -> float:
     """Where its legs are at `STRETCH` of their length, m.
 
     Or as near to it as the joints and a board at `INCLINE` on both axes allow.
@@ -170,7 +165,7 @@ def _body_height(robot: Robot) -> float:
     return round(min(max(wanted, low + room), high - room), 3)
 
 
-def _stiffer(robot: Robot, height: float) -> float:
+def _stiffer(robot: Body, height: float) -> float:
     """Servo gains against our own robot's.
 
     Rolling is the softest of its motions: a mass m at a height h, on legs of a length l whose
@@ -188,66 +183,83 @@ def _digits(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-def _leg(file: RobotFile, model: mujoco.MjModel, said: LegFile, foot: str) -> Leg:
-    """Measures a leg, first as the model draws it, then with the hip's axis level."""
-    name, joints = said.name, said.joints
-    calf = int(model.jnt_bodyid[model.joint(joints[2]).id])
-    holder = int(model.geom(foot).bodyid[0])
-    if calf not in (holder, *ancestors(model, holder)):
-        raise RobotError(
-            f"foot of leg {name} hangs on body {model.body(holder).name!r}; it must hang on what "
-            f"joint {joints[2]!r} moves, {model.body(calf).name!r}"
-        )
-    pose = Pose(model, file.trunk, {})
-    abduction = pose.axis(joints[0])
-    if abs(abduction[0]) < LEVEL:
-        raise RobotError(
-            f"joint {joints[0]!r} of leg {name} turns about {_vector(abduction)} of the trunk; an "
-            "abduction turns about forward, (1, 0, 0) or (-1, 0, 0)"
-        )
-    hip = pose.axis(joints[1])
-    hip = hip * np.sign(hip[1] or 1.0)
-    tilt = math.atan2(hip[2], hip[1])
-    sign = float(np.sign(abduction[0]))
-    pose = Pose(model, file.trunk, {joints[0]: -sign * tilt})
-    signs = [sign]
-    for joint, what in zip(joints[1:], ("hip", "knee"), strict=True):
-        axis = pose.axis(joint)
-        if abs(axis[1]) < LEVEL:
-            raise RobotError(
-                f"joint {joint!r} of leg {name} turns about {_vector(axis)} of the trunk; a "
-                f"{what} turns about the left, (0, 1, 0) or (0, -1, 0)"
-            )
-        signs.append(float(np.sign(axis[1])))
-    at, hip, knee = (pose.anchor(joint) for joint in joints)
+def _leg(file: RobotFile, model: mujoco.MjModel, leg: LegFile, foot: str) -> Leg:
+    """Measures a leg with the hip's axis level; `_placed` gives it its corner."""
+    _check_foot(model, leg, foot)
+    pose, tilt, signs = _level_pose(model, file.trunk, leg)
+    at, hip, knee = (pose.anchor(joint) for joint in leg.joints)
     end = pose.foot(foot)
-    thigh, shank = knee - hip, end - knee
-    leaning = [math.atan2(-v[0], -v[2]) for v in (thigh, shank)]
-    zeros = (_clean(tilt), _clean(leaning[0]), _clean(_wrapped(leaning[1] - leaning[0])))
-    ranges = [_turns(model, *one) for one in zip(joints, signs, zeros, strict=True)]
-    abducts = _levelled(name, joints[0], ranges[0])
-    bend = _bend(said, ranges[1], ranges[2], [math.hypot(v[0], v[2]) for v in (thigh, shank)])
+    thigh, calf = knee - hip, end - knee
+    lengths = [math.hypot(v[0], v[2]) for v in (thigh, calf)]
+    lean, calf_lean = (math.atan2(-v[0], -v[2]) for v in (thigh, calf))
+    zeros = (_clean(tilt), _clean(lean), _clean(math.remainder(calf_lean - lean, 2 * math.pi)))
+    ranges = [_turns(model, *one) for one in zip(leg.joints, signs, zeros, strict=True)]
+    bend = _bend(leg, ranges[1], ranges[2], lengths)
+    whole = _level_turns(leg, ranges[0])
     return Leg(
-        name=name,
-        left=False,  # `_placed` sees
+        name=leg.name,
+        left=False,
         front=False,
-        joints=joints,
+        joints=leg.joints,
         foot=foot,
         x=_clean(hip[0]),
         y=_clean(end[1]),
         axis_height=_clean(at[2]),
         drop=_clean(at[2] - hip[2]),
         offset=_clean(end[1] - at[1]),
-        thigh=_clean(math.hypot(thigh[0], thigh[2])),
-        calf=_clean(math.hypot(shank[0], shank[2])),
-        signs=(signs[0], signs[1], signs[2]),
+        thigh=_clean(lengths[0]),
+        calf=_clean(lengths[1]),
+        signs=signs,
         zeros=(
-            _clean(zeros[0] + abducts),
+            _clean(zeros[0] + whole),
             _clean(zeros[1] + bend.hip),
             _clean(zeros[2] + bend.calf),
         ),
         knee=(_clean(bend.low), _clean(bend.high)),
     )
+
+
+def _check_foot(model: mujoco.MjModel, leg: LegFile, foot: str) -> None:
+    calf = int(model.jnt_bodyid[model.joint(leg.joints[2]).id])
+    holder = int(model.geom(foot).bodyid[0])
+    if calf not in (holder, *ancestors(model, holder)):
+        raise RobotError(
+            f"foot of leg {leg.name} hangs on body {model.body(holder).name!r}; it must hang on "
+            f"what joint {leg.joints[2]!r} moves, {model.body(calf).name!r}"
+        )
+
+
+def _level_pose(
+    model: mujoco.MjModel, trunk: str, leg: LegFile
+) -> tuple[Pose, float, tuple[float, float, float]]:
+    """Turns the abduction until the hip's axis is level.
+
+    Returns:
+      The pose, the axis' angle off level as the model draws it, rad, and the joints' signs, +-1.
+    """
+    drawn = Pose(model, trunk, {})
+    abduction, hip, knee = leg.joints
+    forward = _sign(drawn, leg, abduction, "an abduction turns about forward", 0)
+    axis = drawn.axis(hip) * np.sign(drawn.axis(hip)[1] or 1.0)
+    tilt = math.atan2(axis[2], axis[1])
+    pose = Pose(model, trunk, {abduction: -forward * tilt})
+    left = [
+        _sign(pose, leg, joint, f"a {what} turns about the left", 1)
+        for joint, what in ((hip, "hip"), (knee, "knee"))
+    ]
+    return pose, tilt, (forward, left[0], left[1])
+
+
+def _sign(pose: Pose, leg: LegFile, joint: str, rule: str, along: int) -> float:
+    """Whether a joint's axis points along the trunk's x (0) or y (1), 1, or against it, -1."""
+    axis = pose.axis(joint)
+    if abs(axis[along]) < LEVEL:
+        ways = ("(1, 0, 0) or (-1, 0, 0)", "(0, 1, 0) or (0, -1, 0)")
+        raise RobotError(
+            f"joint {joint!r} of leg {leg.name} turns about {_vector(axis)} of the trunk; {rule}, "
+            f"{ways[along]}"
+        )
+    return float(np.sign(axis[along]))
 
 
 def _placed(legs: list[Leg]) -> tuple[Leg, ...]:
@@ -273,15 +285,16 @@ def _turns(model: mujoco.MjModel, joint: str, sign: float, zero: float) -> tuple
     return float(low), float(high)
 
 
-def _levelled(leg: str, joint: str, turns: tuple[float, float]) -> float:
+def _level_turns(leg: LegFile, turns: tuple[float, float]) -> float:
     """Whole turns that bring the level hip's axis within an abduction's limits, rad."""
     low, high = turns
     for whole in WHOLE_TURNS:
         if low + whole - SLACK <= 0 <= high + whole + SLACK:
             return whole
     raise RobotError(
-        f"joint {joint!r} of leg {leg} turns the hip's axis from {math.degrees(low):.0f} to "
-        f"{math.degrees(high):.0f} deg off level; it must be able to hold it level"
+        f"joint {leg.joints[0]!r} of leg {leg.name} turns the hip's axis from "
+        f"{math.degrees(low):.0f} to {math.degrees(high):.0f} deg off level; it must be able to "
+        "hold it level"
     )
 
 
@@ -303,7 +316,7 @@ class _Bend(NamedTuple):
 
 
 def _bend(
-    said: LegFile, hip: tuple[float, float], knee: tuple[float, float], lengths: list[float]
+    leg: LegFile, hip: tuple[float, float], knee: tuple[float, float], lengths: list[float]
 ) -> _Bend:
     """Which way the knee points, and how far it turns within its limits and the hip's.
 
@@ -311,30 +324,27 @@ def _bend(
     and all legs should bend alike.
 
     Args:
-      said: may say it.
+      leg: may say it.
       hip: least and greatest turn of the thigh, rad.
       knee: of the calf against it, rad.
       lengths: of thigh and calf, m.
     """
-    ways = {
-        name: _bent(side, hip, knee, lengths) for name, side in (("backward", -1), ("forward", 1))
-    }
-    backward, forward = ways["backward"], ways["forward"]
-    if said.knee is not None:
-        chosen = ways[said.knee]
+    backward, forward = (_bent(side, hip, knee, lengths) for side in (-1, 1))
+    if leg.knee is not None:
+        bend = forward if leg.knee == "forward" else backward
     elif backward and forward:
         wide = forward.high - forward.low > 2 * (backward.high - backward.low)
-        chosen = forward if wide else backward
+        bend = forward if wide else backward
     else:
-        chosen = backward or forward
-    if chosen is None:
-        way = f" with the knee {said.knee}" if said.knee else ""
+        bend = backward or forward
+    if bend is None:
+        way = f" with the knee {leg.knee}" if leg.knee else ""
         raise RobotError(
-            f"joints {said.joints[1]!r} and {said.joints[2]!r} of leg {said.name} cannot turn far "
+            f"joints {leg.joints[1]!r} and {leg.joints[2]!r} of leg {leg.name} cannot turn far "
             f"enough to keep its foot under the hip{way}: the thigh turns {_degrees(hip)}, the "
             f"calf against it {_degrees(knee)}"
         )
-    return chosen
+    return bend
 
 
 def _bent(
@@ -370,11 +380,6 @@ def _clean(value: float) -> float:
     return round(float(value), 9) + 0.0
 
 
-def _wrapped(angle: float) -> float:
-    """To -pi .. pi."""
-    return math.remainder(angle, 2 * math.pi)
-
-
 def _degrees(turns: tuple[float, float]) -> str:
     low, high = (math.degrees(x) for x in turns)
     return "freely" if math.isinf(low) else f"from {low:.0f} to {high:.0f} deg"
@@ -385,62 +390,59 @@ def _vector(v: np.ndarray) -> str:
 
 
 def _check_corners(file: RobotFile, legs: tuple[Leg, ...]) -> None:
-    corners: dict[tuple[bool, bool], str] = {}
-    for said, leg in zip(file.legs, legs, strict=True):
-        for word, found, options in (
-            (said.side, leg.left, ("left", "right")),
-            (said.end, leg.front, ("front", "hind")),
-        ):
-            placed = options[0] if found else options[1]
-            if word not in (None, placed):
-                raise RobotError(f"leg {leg.name} is said to be {word}, but it stands {placed}")
-        corner = (leg.left, leg.front)
-        if corner in corners:
-            place = f"{'front' if leg.front else 'hind'} {'left' if leg.left else 'right'}"
+    """Each corner has one leg, which stands where the file says."""
+    corners: dict[tuple[str, str], str] = {}
+    for words, leg in zip(file.legs, legs, strict=True):
+        side, end = "left" if leg.left else "right", "front" if leg.front else "hind"
+        for word, place in ((words.side, side), (words.end, end)):
+            if word not in (None, place):
+                raise RobotError(f"leg {leg.name} is said to be {word}, but it stands {place}")
+        other = corners.setdefault((end, side), leg.name)
+        if other != leg.name:
             raise RobotError(
-                f"legs {corners[corner]} and {leg.name} both stand {place}; each corner has one"
+                f"legs {other} and {leg.name} both stand {end} {side}; each corner has one"
             )
-        corners[corner] = leg.name
 
 
 def _check_bends(file: RobotFile, legs: tuple[Leg, ...]) -> None:
     """Left and right legs are mirror images, or the file says that they are not."""
-    said = {leg.name: leg.knee for leg in file.legs}
-    for leg in legs:
-        for other in legs:
-            mirrored = leg.front == other.front and leg.left and not other.left
-            differ = sum(leg.knee) * sum(other.knee) < 0
-            if mirrored and differ and None in (said[leg.name], said[other.name]):
-                way = "forward" if sum(leg.knee) > 0 else "backward"
-                raise RobotError(
-                    f"knees of legs {leg.name} and {other.name} would point different ways, that "
-                    f"of {leg.name} {way}; say knee of both"
-                )
+    unsaid = {leg.name for leg in file.legs if leg.knee is None}
+    for leg, other in itertools.product(legs, legs):
+        mirrored = leg.front == other.front and leg.left and not other.left
+        differ = sum(leg.knee) * sum(other.knee) < 0
+        if mirrored and differ and unsaid & {leg.name, other.name}:
+            way = "forward" if sum(leg.knee) > 0 else "backward"
+            raise RobotError(
+                f"knees of legs {leg.name} and {other.name} would point different ways, that "
+                f"of {leg.name} {way}; say knee of both"
+            )
 
 
 UNLIMITED = 1e4
 """Torque of servos that neither file nor model limit, N m."""
 
 
-def _torque(model: mujoco.MjModel, joint: str) -> float:
-    """What the model's own actuators can do at a joint, N m."""
-    number = model.joint(joint).id
-    limits = []
-    if model.jnt_actfrclimited[number]:
-        limits.append(np.abs(model.jnt_actfrcrange[number]).max())
+def _torque(model: mujoco.MjModel, joints: list[str]) -> float:
+    """What the model's own actuators can do at the weakest of some joints, N m."""
+    limits = [limit for joint in joints for limit in _limits(model, model.joint(joint).id)]
+    return float(min(limits, default=UNLIMITED))
+
+
+def _limits(model: mujoco.MjModel, joint: int) -> Iterator[float]:
+    if model.jnt_actfrclimited[joint]:
+        yield np.abs(model.jnt_actfrcrange[joint]).max()
+    kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
     for k in range(model.nu):
-        kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-        moves = mujoco.mjtTrn(int(model.actuator_trntype[k])) in kinds
-        if not moves or model.actuator_trnid[k, 0] != number:
+        transmission = mujoco.mjtTrn(int(model.actuator_trntype[k]))
+        if transmission not in kinds or model.actuator_trnid[k, 0] != joint:
             continue
         gear = abs(model.actuator_gear[k, 0])
         if model.actuator_forcelimited[k]:
-            limits.append(gear * np.abs(model.actuator_forcerange[k]).max())
+            yield gear * np.abs(model.actuator_forcerange[k]).max()
         motor = (
             model.actuator_gaintype[k] == mujoco.mjtGain.mjGAIN_FIXED
             and model.actuator_biastype[k] == mujoco.mjtBias.mjBIAS_NONE
         )
         if motor and model.actuator_ctrllimited[k]:
             gain = abs(model.actuator_gainprm[k, 0])
-            limits.append(gear * gain * np.abs(model.actuator_ctrlrange[k]).max())
-    return float(min(limits, default=UNLIMITED))
+            yield gear * gain * np.abs(model.actuator_ctrlrange[k]).max()

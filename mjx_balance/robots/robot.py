@@ -63,8 +63,8 @@ class Leg:
 
 
 @dataclasses.dataclass(frozen=True)
-class Robot:
-    """Measured on the compiled model by `measure.measure`; legs in observation order."""
+class Body:
+    """Geometry and mass, measured on the compiled model; legs in observation order."""
 
     __pydantic_config__ = STRICT
 
@@ -79,22 +79,6 @@ class Robot:
     """kg"""
     total_mass: Number
     """kg"""
-    hip_torque: Number
-    """Limit of the abduction and hip servos, N m."""
-    knee_torque: Number
-    """Limit of the knee servos, N m."""
-    servo_stiffness: Number
-    """Position gain of the leg servos, N m / rad."""
-    servo_damping: Number
-    """Damping of the leg joints, N m s / rad."""
-    servo_armature: Number
-    """Inertia of rotor and gear at the joint, kg m^2."""
-    foot_friction: Number
-    """Sliding friction of a foot on the board."""
-    body_height: Number
-    """Standing height of the trunk's origin above the board, foot radius included, m."""
-    action_max: Number
-    """Greatest height change of one decision on one axis, m."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -151,6 +135,28 @@ class Robot:
     def each(self, name: str) -> np.ndarray:
         """One number of every leg, (legs, ...)."""
         return np.asarray([getattr(leg, name) for leg in self.legs], float)
+
+
+@dataclasses.dataclass(frozen=True)
+class Robot(Body):
+    """A body with servos and feet (`measure.measure`)."""
+
+    hip_torque: Number
+    """Limit of the abduction and hip servos, N m."""
+    knee_torque: Number
+    """Limit of the knee servos, N m."""
+    servo_stiffness: Number
+    """Position gain of the leg servos, N m / rad."""
+    servo_damping: Number
+    """Damping of the leg joints, N m s / rad."""
+    servo_armature: Number
+    """Inertia of rotor and gear at the joint, kg m^2."""
+    foot_friction: Number
+    """Sliding friction of a foot on the board."""
+    body_height: Number
+    """Standing height of the trunk's origin above the board, foot radius included, m."""
+    action_max: Number
+    """Greatest height change of one decision on one axis, m."""
 
 
 def robot_from_dict(values: Any) -> Robot:
