@@ -1,5 +1,6 @@
 """The presets are possible, impossible configs are refused by name."""
 
+import ast
 import dataclasses
 import json
 import subprocess
@@ -76,133 +77,61 @@ def test_every_preset_can_be_run_and_survives_json(name: str) -> None:
     assert from_dict(Config, json.loads(json.dumps(to_dict(config)))) == config
 
 
-PAPERS: dict[str, Any] = {  # sections 2 to 4 of the paper
-    "sim_dt": 0.004,
-    "ctrl_dt": 0.2,
-    "body_height": 0.35,
-    "fail_tilt": 6.0,
-    "gamma": 0.1,
-    "max_incline": 7.0,
-    "board_rate": 3.5,
-    "target_period": 10.0,
-    "square_share": 0.0,
-    "action_levels": 21,
-    "action_max": 0.003,
-    "num_env_steps": 200_000,
-    "head": "joint",
-    "reward_level": 0.4,
-    "reward_sharpness": 1.5,
-    "reward_fail": -0.5,
-    "double": False,
-    "gyro_lags": [0, 1, 2, 3, 4, 5],
-    "accel_lags": [0, 2, 4, 6, 8, 10, 12, 14, 15],
-    "learning_rate": 1e-5,
-    "learning_rate_end_share": 1.0,
-}
-CHOSEN: dict[str, Any] = {  # where the paper is silent; the shipped policies stand on these
-    "action_ramp": 0.1,
-    "height_scale": 0.01,
-    "episode_length": 300,
-    "gyro_scale": 0.017453292519943295,
-    "accel_scale": 0.171208107,  # 1 deg; 9.81 sin(1 deg)
-    "replay_capacity": 131_072,
-    "epsilon_start": 1.0,
-    "epsilon_end": 0.05,
-    "max_grad_norm": 10.0,
-    "eval_scenarios": 128,
-    "eval_duration": 60.0,
-    "num_seeds": 1,
-    "eval_every": 20_000,
-    "export": "last",
-    "validation_scenarios": 4,
-    "seed": 0,
-    "validation_duration": 20.0,
-    "num_devices": None,
-    "payload_offset": 0.05,
-    "payload_height": 0.08,
-}
-OURS: dict[str, Any] = {
-    "square_share": 0.5,
-    "reward_tilt": "mean",
-    "target_update_period": 200,
-    "num_envs": None,
-    "exploration_noise": 2,
-    "learning_rate_end_share": 1 / 300,
-    "reward_toward": 1.0,
-    "reward_toward_scale": 2.5,
-    "head": "radial",
-    "hidden_sizes": [64, 64],
-    "mirror": True,
-    "double": False,
-    "whiten_steps": 50_000,
-}
-PRESET_VALUES: dict[str, dict[str, Any]] = {
-    "paper": {
-        **PAPERS,
-        **CHOSEN,
-        "imu_mean": 1,
-        "command_lags": [],
-        "reward_tilt": "end",
-        "batch_size": 32,
-        "replay_ratio": 32,
-        "target_update_period": 1_000,
-        "num_envs": 64,
-        "reward_toward": 0.4,
-        "reward_toward_scale": 1.0,
-        "hidden_sizes": [256, 256],
-        "min_replay_size": 4_096,
-        "epsilon_decay_steps": 50_000,
-        "mirror": False,
-        "whiten_steps": 0,
-    },
-    "default": {
-        **CHOSEN,
-        **OURS,
-        "gamma": 0.1,
-        "whiten_floor": 1e-3,
-        "learning_rate": 1e-2,
-        "batch_size": 256,
-        "replay_ratio": 32,
-        "min_replay_size": 1_024,
-        "epsilon_decay_steps": 5_000,
-        "num_env_steps": 40_000,
-    },
-    "best": {
-        **CHOSEN,
-        **OURS,
-        "gamma": 0.4,
-        "whiten_floor": 0.02,
-        "learning_rate": 3e-3,
-        "batch_size": 512,
-        "replay_ratio": 64,
-        "min_replay_size": 2_048,
-        "epsilon_decay_steps": 10_000,
-        "num_env_steps": 200_000,
-        "gain_spread": 0.0,
-        "gyro_noise": 0.002,
-        "accel_noise": 0.023,
-        "payload": 5.0,
-        "latency_share": 0.15,
-        "push_min": 0.0,
-        "push_max": 0.4,
-        "push_period": 2.5,
-        "command_lags": [0, 1, 2],
-        "friction_min": None,
-        "friction_max": None,
-    },
-    "smoke": {
-        **OURS,
-        "num_envs": 64,
-        "num_env_steps": 8_192,
-        "log_every": 1_024,
-        "eval_scenarios": 16,
-        "eval_duration": 20.0,
-        "eval_every": 4_096,
-        "validation_scenarios": 2,
-        "validation_duration": 10.0,
-        "whiten_steps": 2_048,
-        "epsilon_decay_steps": 4_096,
-    },
+def numbers(text: str) -> dict[str, Any]:
+    """Reads "field=value ..."."""
+    entries = (entry.partition("=") for entry in text.split())
+    return {name: ast.literal_eval(value) for name, _, value in entries}
+
+
+PAPERS = numbers(  # sections 2 to 4 of the paper
+    """sim_dt=0.004 ctrl_dt=0.2 body_height=0.35 fail_tilt=6.0 gamma=0.1 max_incline=7.0
+    board_rate=3.5 target_period=10.0 square_share=0.0 action_levels=21 action_max=0.003
+    num_env_steps=200_000 head='joint' reward_level=0.4 reward_sharpness=1.5 reward_fail=-0.5
+    double=False gyro_lags=[0,1,2,3,4,5] accel_lags=[0,2,4,6,8,10,12,14,15]
+    learning_rate=1e-5 learning_rate_end_share=1.0"""
+)
+CHOSEN = numbers(  # where the paper is silent; scales of 1 deg and 9.81 sin(1 deg)
+    """action_ramp=0.1 height_scale=0.01 episode_length=300 gyro_scale=0.01745329
+    accel_scale=0.171208107 replay_capacity=131_072 epsilon_start=1.0 epsilon_end=0.05
+    max_grad_norm=10.0 eval_scenarios=128 eval_duration=60.0 num_seeds=1 eval_every=20_000
+    export='last' validation_scenarios=4 seed=0 validation_duration=20.0 num_devices=None
+    payload_offset=0.05 payload_height=0.08"""
+)
+OURS = numbers(
+    """square_share=0.5 reward_tilt='mean' target_update_period=200 num_envs=None
+    exploration_noise=2 learning_rate_end_share=0.00333333333 reward_toward=1.0
+    reward_toward_scale=2.5 head='radial' hidden_sizes=[64,64] mirror=True double=False
+    whiten_steps=50_000"""
+)
+PRESET_VALUES = {
+    "paper": PAPERS
+    | CHOSEN
+    | numbers(
+        """imu_mean=1 command_lags=[] reward_tilt='end' batch_size=32 replay_ratio=32
+        target_update_period=1_000 num_envs=64 reward_toward=0.4 reward_toward_scale=1.0
+        hidden_sizes=[256,256] min_replay_size=4_096 epsilon_decay_steps=50_000 mirror=False
+        whiten_steps=0"""
+    ),
+    "default": CHOSEN
+    | OURS
+    | numbers(
+        """gamma=0.1 whiten_floor=1e-3 learning_rate=1e-2 batch_size=256 replay_ratio=32
+        min_replay_size=1_024 epsilon_decay_steps=5_000 num_env_steps=40_000"""
+    ),
+    "best": CHOSEN
+    | OURS
+    | numbers(
+        """gamma=0.4 whiten_floor=0.02 learning_rate=3e-3 batch_size=512 replay_ratio=64
+        min_replay_size=2_048 epsilon_decay_steps=10_000 num_env_steps=200_000 gain_spread=0.0
+        gyro_noise=0.002 accel_noise=0.023 payload=5.0 latency_share=0.15 push_min=0.0
+        push_max=0.4 push_period=2.5 command_lags=[0,1,2] friction_min=None friction_max=None"""
+    ),
+    "smoke": OURS
+    | numbers(
+        """num_envs=64 num_env_steps=8_192 log_every=1_024 eval_scenarios=16 eval_duration=20.0
+        eval_every=4_096 validation_scenarios=2 validation_duration=10.0 whiten_steps=2_048
+        epsilon_decay_steps=4_096"""
+    ),
 }
 
 
