@@ -145,7 +145,7 @@ def _child(value: Any, place: str | int) -> Any:
         return value.get(place)
     if isinstance(value, (list, tuple)):
         return value[place] if isinstance(place, int) and place < len(value) else None
-    return vars(value).get(place) if dataclasses.is_dataclass(value) else None
+    return getattr(value, str(place), None) if dataclasses.is_dataclass(value) else None
 
 
 def _unknown_field(name: str, owner: str, kind: Any, path: tuple[str | int, ...]) -> str:
