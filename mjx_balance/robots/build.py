@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.files.text import quote
+from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.robots.measure import Pose, check_joints, measure
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import Foot, RobotError, RobotFile
@@ -49,7 +49,7 @@ def model_path(model: str, folder: Path) -> Path:
     else:
         path = _package(where, model) / inside
     if "\0" in model or not path.is_file():
-        raise RobotError(f"model is {model!r}, but there is no file {path}")
+        raise RobotError(f"model is {quote(model)}, but there is no file {path}")
     return path
 
 
@@ -61,8 +61,8 @@ def _package(name: str, model: str) -> Path:
         spec = None
     if spec is None or not spec.submodule_search_locations:
         raise RobotError(
-            f"model is {model!r}, but the Python package {name!r} is not installed; before a colon "
-            "stands a package, and a file's path has none"
+            f"model is {quote(model)}, but the Python package {quote(name)} is not installed; "
+            "before a colon stands a package, and a file's path has none"
         )
     return Path(spec.submodule_search_locations[0])
 
@@ -104,7 +104,8 @@ def read_model(path: Path) -> mujoco.MjSpec:
 
 def words(error: Exception) -> str:
     """MuJoCo's, in one line: those after the first name the element."""
-    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+    lines = (line.strip() for line in str(error).splitlines())
+    return shorten("; ".join(line for line in lines if line), MESSAGE)
 
 
 def build(file: RobotFile, visual: bool = False) -> tuple[mujoco.MjSpec, Robot]:
@@ -128,7 +129,7 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     trunk = _find(spec.bodies[1:], file.trunk, "trunk", "bodies")
     free = [j for j in trunk.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
-        raise RobotError(f"trunk {file.trunk!r} has no free joint; {_remedy(trunk)}")
+        raise RobotError(f"trunk {quote(file.trunk)} has no free joint; {_remedy(trunk)}")
     _keep_inertia(spec, trunk)
     _strip(spec, trunk, file)
     feet = {leg.name: _foot(spec, leg.foot, leg.name) for leg in file.legs}
@@ -156,7 +157,7 @@ def _remedy(trunk: mujoco.MjsBody) -> str:
     while root.parent.name != "world":
         root = root.parent
     if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in root.joints):
-        return f"it hangs on body {root.name!r}, which has one and is the trunk"
+        return f"it hangs on body {quote(root.name)}, which has one and is the trunk"
     return "it must be free to move; give it a <freejoint/> in its model"
 
 
@@ -171,9 +172,8 @@ def _find(elements: list, name: str, what: str, kind: str):
     for element in elements:
         if element.name == name:
             return element
-    names = [x.name for x in elements if x.name]
-    shown = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
-    raise RobotError(f"{what} is {name!r}, which its model does not have; its {kind}: {shown}")
+    names = shorten(", ".join(x.name for x in elements if x.name), MESSAGE)
+    raise RobotError(f"{what} is {quote(name)}, which its model does not have; its {kind}: {names}")
 
 
 def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
@@ -183,7 +183,9 @@ def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
     gone |= {joint.name for joint in joints}
     for leg in file.legs:
         for joint in [x for x in leg.joints if x in gone]:
-            raise RobotError(f"strip takes joint {joint!r} of leg {leg.name}, which the leg needs")
+            raise RobotError(
+                f"strip takes joint {quote(joint)} of leg {leg.name}, which the leg needs"
+            )
     usual = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
     for actuator in [a for a in spec.actuators if a.trntype not in usual or a.target in gone]:
         spec.delete(actuator)
@@ -216,11 +218,13 @@ def _stripped(
     joints = {j.name: j for j in spec.joints if j.name in file.strip}
     for name in file.strip:
         if name not in bodies and name not in joints:
-            raise RobotError(f"strip names {name!r}, which is no body and no joint of its model")
+            raise RobotError(
+                f"strip names {quote(name)}, which is no body and no joint of its model"
+            )
         if name in carries:
-            raise RobotError(f"strip names {name!r}, which is, or carries, the trunk")
+            raise RobotError(f"strip names {quote(name)}, which is, or carries, the trunk")
         if name in [j.name for j in trunk.joints]:
-            raise RobotError(f"strip names {name!r}, by which the trunk is free; it must be")
+            raise RobotError(f"strip names {quote(name)}, by which the trunk is free; it must be")
     below = {x.name for b in bodies.values() for x in b.find_all(mujoco.mjtObj.mjOBJ_BODY)}
     outer = [b for b in bodies.values() if b.name not in below]
     gone = {j.name for b in outer for j in _joints_below(b)}
@@ -475,7 +479,7 @@ def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file
         site = model.site(file.imu)
         holder = model.body(int(site.bodyid[0])).name
         if holder != trunk.name:
-            raise RobotError(f"imu {file.imu!r} is on body {holder!r}, not on the trunk")
+            raise RobotError(f"imu {quote(file.imu)} is on body {quote(holder)}, not on the trunk")
         if np.allclose(site.quat, (1, 0, 0, 0)):
             return site.name
         place = site.pos

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import mujoco
 
+from mjx_balance.files.text import quote
 from mjx_balance.robots.build import build, model_path
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.robot import Leg, Robot, robot_from_dict
@@ -52,8 +53,8 @@ def robot_file(name: str) -> RobotFile:
         return _drafted(name)
     if name not in shipped():
         raise RobotError(
-            f"robot is {name!r}; known robots: {', '.join(shipped())}; or menagerie:NAME, or a "
-            "TOML file"
+            f"robot is {quote(name)}; known robots: {', '.join(shipped())}; or menagerie:NAME, or "
+            "a TOML file"
         )
     return read_robot_file(SHIPPED / f"{name}.toml")
 

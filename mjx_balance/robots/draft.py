@@ -9,6 +9,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_balance.files.text import quote
 from mjx_balance.robots.build import ALIKE, read_model, words
 from mjx_balance.robots.measure import ancestors
 from mjx_balance.robots.schema import RobotError, parse_robot_file
@@ -166,7 +167,7 @@ def _name(name: str, what: str) -> str:
 def _joints(model: mujoco.MjModel, joints: Iterable[int]) -> str:
     """Their names, as TOML writes a list."""
     holders = {k: model.body(int(model.jnt_bodyid[k])).name for k in joints}
-    names = [_name(model.joint(k).name, f"a joint of body {holders[k]!r}") for k in holders]
+    names = [_name(model.joint(k).name, f"a joint of body {quote(holders[k])}") for k in holders]
     return f"[{', '.join(names)}]"
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_balance.files.text import quote
 from mjx_balance.files.validation import check_types
 from mjx_balance.robots.robot import (
     OUR_LEVER,
@@ -89,27 +90,29 @@ def check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
         for joint in leg.joints:
             if joint not in moving:
                 raise RobotError(
-                    f"joint {joint!r} of leg {name} is none of its model's; they are: "
+                    f"joint {quote(joint)} of leg {name} is none of its model's; they are: "
                     f"{', '.join(moving)}"
                 )
             if model.joint(joint).type[0] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise RobotError(f"joint {joint!r} of leg {name} is no hinge")
+                raise RobotError(f"joint {quote(joint)} of leg {name} is no hinge")
             body = int(model.jnt_bodyid[model.joint(joint).id])
             if above == body:
                 raise RobotError(
-                    f"joint {joint!r} of leg {name} is on body {model.body(body).name!r}, as the "
-                    "one before it; each joint of a leg needs a body of its own"
+                    f"joint {quote(joint)} of leg {name} is on body "
+                    f"{quote(model.body(body).name)}, as the one before it; each joint of "
+                    "a leg needs a body of its own"
                 )
             if above not in ancestors(model, body):
                 raise RobotError(
-                    f"joint {joint!r} of leg {name} does not hang on {model.body(above).name!r}; "
-                    "joints go from the trunk down: abduction, hip, knee"
+                    f"joint {quote(joint)} of leg {name} does not hang on "
+                    f"{quote(model.body(above).name)}; joints go from the trunk "
+                    "down: abduction, hip, knee"
                 )
             above = body
     listed = {joint for leg in file.legs for joint in leg.joints}
     extra = [name for name in moving if name not in listed]
     if extra:
-        raise RobotError(f"joint {extra[0]!r} is in no leg; strip it, and it is fixed")
+        raise RobotError(f"joint {quote(extra[0])} is in no leg; strip it, and it is fixed")
 
 
 def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
@@ -224,8 +227,8 @@ def _check_foot(model: mujoco.MjModel, leg: LegFile, foot: str) -> None:
     holder = int(model.geom(foot).bodyid[0])
     if calf not in (holder, *ancestors(model, holder)):
         raise RobotError(
-            f"foot of leg {leg.name} hangs on body {model.body(holder).name!r}; it must hang on "
-            f"what joint {leg.joints[2]!r} moves, {model.body(calf).name!r}"
+            f"foot of leg {leg.name} hangs on body {quote(model.body(holder).name)}; it must hang "
+            f"on what joint {quote(leg.joints[2])} moves, {quote(model.body(calf).name)}"
         )
 
 
@@ -256,8 +259,8 @@ def _sign(pose: Pose, leg: LegFile, joint: str, rule: str, along: int) -> float:
     if abs(axis[along]) < LEVEL:
         ways = ("(1, 0, 0) or (-1, 0, 0)", "(0, 1, 0) or (0, -1, 0)")
         raise RobotError(
-            f"joint {joint!r} of leg {leg.name} turns about {_vector(axis)} of the trunk; {rule}, "
-            f"{ways[along]}"
+            f"joint {quote(joint)} of leg {leg.name} turns about {_vector(axis)} of the trunk; "
+            f"{rule}, {ways[along]}"
         )
     return float(np.sign(axis[along]))
 
@@ -292,7 +295,7 @@ def _level_turns(leg: LegFile, turns: tuple[float, float]) -> float:
         if low + whole - SLACK <= 0 <= high + whole + SLACK:
             return whole
     raise RobotError(
-        f"joint {leg.joints[0]!r} of leg {leg.name} turns the hip's axis from "
+        f"joint {quote(leg.joints[0])} of leg {leg.name} turns the hip's axis from "
         f"{math.degrees(low):.0f} to {math.degrees(high):.0f} deg off level; it must be able to "
         "hold it level"
     )
@@ -340,9 +343,9 @@ def _bend(
     if bend is None:
         way = f" with the knee {leg.knee}" if leg.knee else ""
         raise RobotError(
-            f"joints {leg.joints[1]!r} and {leg.joints[2]!r} of leg {leg.name} cannot turn far "
-            f"enough to keep its foot under the hip{way}: the thigh turns {_degrees(hip)}, the "
-            f"calf against it {_degrees(knee)}"
+            f"joints {quote(leg.joints[1])} and {quote(leg.joints[2])} of leg {leg.name} cannot "
+            f"turn far enough to keep its foot under the hip{way}: the thigh turns "
+            f"{_degrees(hip)}, the calf against it {_degrees(knee)}"
         )
     return bend
 

@@ -14,6 +14,7 @@ from typing import TypeVar, cast
 import orbax.checkpoint as ocp
 
 from mjx_balance.errors import InputError
+from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.training.processes import ALONE, Processes, ProcessLostError
 
 T = TypeVar("T")
@@ -65,8 +66,8 @@ def save(directory: Path, env_steps: int, state: object, processes: Processes = 
     except ProcessLostError:
         raise
     except Exception as error:  # whatever orbax raises on a full disk, say
-        said = " ".join(str(error).split())[:300]
-        raise CheckpointError(f"the checkpoint {path} cannot be written: {said}") from error
+        reason = shorten(error, MESSAGE)
+        raise CheckpointError(f"the checkpoint {path} cannot be written: {reason}") from error
 
 
 def restore(

@@ -42,7 +42,7 @@ HINTS = {
 NAN, INF = float("nan"), float("inf")
 
 
-def changed(config: Config | None = None, **values: Any) -> Config:
+def changed(config: Config | None = None, /, **values: Any) -> Config:
     """A config, the paper's if none, with fields of any section replaced."""
     config = config or preset("paper")
     for name, value in values.items():
@@ -150,8 +150,8 @@ def test_presets_differ_in_no_more_than_they_say() -> None:
     for config in (paper, default, quick, preset("smoke")):
         assert config.randomization == RandomizationConfig()
     assert preset("smoke").task == default.task
-    few_often = {"num_env_steps": 8_192, "eval_every": 0, "replay_ratio": 128.0}
-    own = {"preset": "quick", "epsilon_decay_steps": 3_000}
+    few_often: dict[str, Any] = {"num_env_steps": 8_192, "eval_every": 0, "replay_ratio": 128.0}
+    own: dict[str, Any] = {"preset": "quick", "epsilon_decay_steps": 3_000}
     assert quick == changed(default, **few_often, **own)
 
 
