@@ -16,21 +16,21 @@ def code(module: str, package: Path = PACKAGE) -> dict[str, str]:
     Returns:
       Module -> its code without comments and docstrings, which decide nothing.
     """
-    found: dict[str, str] = {}
-    _collect(package, module, found)
-    return found
+    modules: dict[str, str] = {}
+    _collect(package, module, modules)
+    return modules
 
 
-def _collect(package: Path, name: str, found: dict[str, str]) -> None:
+def _collect(package: Path, name: str, modules: dict[str, str]) -> None:
     root, *parts = name.split(".")
-    if root != PACKAGE.name or not parts or name in found:
+    if root != PACKAGE.name or not parts or name in modules:
         return
     inside = package.joinpath(*parts)
     file = inside / "__init__.py" if inside.is_dir() else inside.with_suffix(".py")
     if not file.is_file():  # a name in a module
         return
     tree = _WithoutWords().visit(ast.parse(file.read_text(encoding="utf-8")))
-    found[name] = ast.unparse(tree)
+    modules[name] = ast.unparse(tree)
     targets = [name.rpartition(".")[0]]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -39,7 +39,7 @@ def _collect(package: Path, name: str, found: dict[str, str]) -> None:
             targets += [f"{node.module}.{alias.name}" for alias in node.names]
             targets.append(str(node.module))
     for target in targets:
-        _collect(package, target, found)
+        _collect(package, target, modules)
 
 
 class _WithoutWords(ast.NodeTransformer):
