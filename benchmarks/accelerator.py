@@ -99,9 +99,9 @@ def rates(engine: str, sizes: list[int]) -> Iterator[Row]:
 def training(engine: str) -> Iterator[Row]:
     """One row: preset `default`, sized as a run is."""
     config, learner = throughput.make_learner(engine=engine, num_devices=None)
-    iterations = iterations_of(learner.num_envs)
+    iterations = iterations_of(learner.spec.num_envs)
     program = throughput.training_program(config, learner, iterations)
-    yield timed(program, learner.num_envs, config, iterations)
+    yield timed(program, learner.spec.num_envs, config, iterations)
 
 
 def whole_run(engine: str, num_envs: int, start: str, work: Path) -> Iterator[Row]:

@@ -252,7 +252,7 @@ def trained_policy(products: str, num_envs: int, seed: int, decisions: int | Non
         program, state = learner.train_program(8), learner.init(seed)
         for _ in range(-(-(decisions or config.num_env_steps) // (8 * num_envs))):
             state, _ = jax.block_until_ready(program(state))
-    params = jax.device_get(learner.exported(state))
+    params = jax.device_get(learner.export_params(state))
     with tempfile.TemporaryDirectory() as folder:
         manifest = make_manifest(config, env.scene.hash, {})
         return save_policy(Path(folder) / "policy.safetensors", params, manifest)

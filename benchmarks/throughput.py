@@ -39,9 +39,9 @@ with quiet_imports("torch"):
     import jax.numpy as jnp
     from jax.flatten_util import ravel_pytree
 
-    from mjx_balance.dqn.collecting import reset_done
-    from mjx_balance.dqn.devices import device_key, mean_over_devices, on_each_device
-    from mjx_balance.dqn.learner import REPLICATED, Learner
+    from mjx_balance.dqn import DQN
+    from mjx_balance.dqn.dqn import reset_done
+    from mjx_balance.dqn.mesh import REPLICATED, device_key, mean_over_devices, on_each_device
     from mjx_balance.envs.balance import BalanceEnv
     from mjx_balance.training import processes as run_processes
     from mjx_balance.training import program_cache, sizing
@@ -72,7 +72,7 @@ class Program:
         self.state, _ = jax.block_until_ready(self.run(self.state))
 
 
-def make_learner(config: Config | None = None, **fields: Any) -> tuple[Config, Learner]:
+def make_learner(config: Config | None = None, **fields: Any) -> tuple[Config, DQN]:
     """A config (preset `default`) with other fields, sized, and its learner; in a new process."""
     sizing.configure_jax(common.log)
     jax.config.update("jax_enable_compilation_cache", False)  # to time the compilation
@@ -82,7 +82,7 @@ def make_learner(config: Config | None = None, **fields: Any) -> tuple[Config, L
 
 
 def training_program(
-    config: Config, learner: Learner, iterations: int, ready: Callable[[], Any] = lambda: None
+    config: Config, learner: DQN, iterations: int, ready: Callable[[], Any] = lambda: None
 ) -> Program:
     """Training with its replay filled, so that every call makes its updates.
 
@@ -91,13 +91,13 @@ def training_program(
     program = Program(learner.train_program(iterations), learner.init(0))
     ready()
     seeds = config.num_seeds
-    decisions = iterations * learner.num_envs * seeds
+    decisions = iterations * learner.spec.num_envs * seeds
     for _ in range(config.dqn.min_replay_size * seeds // decisions + 2):
         program()
     return program
 
 
-def env_program(learner: Learner, iterations: int, act: Callable[..., Any] | None = None) -> Any:
+def env_program(learner: DQN, iterations: int, act: Callable[..., Any] | None = None) -> Any:
     """The env alone, done envs reset as in training: (env state, key) -> (the same, nothing).
 
     `act` maps observations (n, obs_size) to actions (n,); they are random if none.
@@ -116,7 +116,7 @@ def env_program(learner: Learner, iterations: int, act: Callable[..., Any] | Non
         state, _ = jax.lax.scan(step, state, jnp.asarray(keys))
         return (state, next_key), jnp.zeros(())
 
-    specs = (learner.specs.env_state, REPLICATED)
+    specs = (learner.state_specs.env_state, REPLICATED)
     each = on_each_device(program, learner.mesh, in_specs=(specs,), out_specs=(specs, REPLICATED))
     return jax.jit(each)
 
@@ -264,7 +264,7 @@ def process_row(place: Any, engine: str, num_envs: int, batches: int, rounds: in
             "decisions_per_second": iterations * num_envs / statistics.median(seconds["training"]),
             "exchange_s": statistics.median(seconds["exchange"]) / EXCHANGES,
             "gradient_bytes": gradients.nbytes,
-            "updates_per_decision": learner.updates / num_envs,
+            "updates_per_decision": learner.spec.updates_per_iteration / num_envs,
         }
 
 

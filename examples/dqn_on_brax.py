@@ -5,7 +5,6 @@ python examples/dqn_on_brax.py [--decisions 60000] [--seed 0]
 
 import argparse
 import time
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +13,7 @@ from brax.envs.inverted_pendulum import InvertedPendulum
 from brax.envs.wrappers.training import EpisodeWrapper
 
 from mjx_balance.config import DQNConfig
-from mjx_balance.dqn.learner import Learner
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn import DQN, DQNSpec, QNetwork, TrainState
 
 FORCES = jnp.array([[-0.3], [-0.05], [0.0], [0.05], [0.3]])
 """What each of the discrete actions is to the pendulum, which takes -1 to 1."""
@@ -36,7 +34,7 @@ DECISIONS = 60_000
 
 
 class Discrete(Wrapper):
-    """An env whose action is the number of a force."""
+    """An env whose action is the index of a force."""
 
     @property
     def action_size(self) -> int:
@@ -51,22 +49,23 @@ def pendulum() -> Env:
     return EpisodeWrapper(Discrete(InvertedPendulum()), EPISODE, action_repeat=1)
 
 
-def train(env: Env, decisions: int, seed: int, num_envs: int = 64) -> tuple[Learner, Any]:
-    """A learner and the state at the end of its run."""
+def train(env: Env, decisions: int, seed: int, num_envs: int = 64) -> tuple[DQN, TrainState]:
+    """A DQN and the state at the end of its run."""
     network = QNetwork(CONFIG.hidden_sizes, (env.action_size,))
-    # One device, whatever there is: another number of them is another run.
-    learner = Learner(env, network, CONFIG, num_envs, decisions, jax.devices()[:1])
-    state, _ = learner.train_program(decisions // num_envs)(learner.init(seed))
-    return learner, state
+    # One device: another number of devices draws other random numbers.
+    spec = DQNSpec(CONFIG, num_envs, num_env_steps=decisions, devices=jax.devices()[:1])
+    dqn = DQN(env, network, spec)
+    state, _ = dqn.train_program(decisions // num_envs)(dqn.init(seed))
+    return dqn, state
 
 
-def held_out(learner: Learner, state: Any, episodes: int = 64) -> jax.Array:
+def held_out(dqn: DQN, state: TrainState, episodes: int = 64) -> jax.Array:
     """(episodes,) decisions for which the greedy policy keeps the pole up."""
-    env, params = learner.env, learner.exported(state)
+    env, params = dqn.env, dqn.export_params(state)
 
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], jax.Array]:
         env_state, up = carry
-        values = jnp.asarray(learner.network.apply(params, env_state.obs))
+        values = jnp.asarray(dqn.network.apply(params, env_state.obs))
         best = values.argmax(axis=-1)
         env_state = jax.vmap(env.step)(env_state, best)
         up &= ~((env_state.done > 0) & (env_state.info["truncation"] == 0))
@@ -84,8 +83,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     began = time.perf_counter()
-    learner, state = train(pendulum(), args.decisions, args.seed)
-    up = held_out(learner, state)
+    dqn, state = train(pendulum(), args.decisions, args.seed)
+    up = held_out(dqn, state)
     seconds = time.perf_counter() - began
     print(f"{seconds:.0f} s: up for {up.mean():.0f} of {EPISODE} decisions, at least {up.min()}")
 

@@ -18,8 +18,7 @@ import pytest
 from flax import linen as nn
 
 from mjx_balance.config import DQNConfig, TaskConfig
-from mjx_balance.dqn.learner import Learner
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 from mjx_balance.evaluation.rollout import Rollout
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.policy.file import load_policy
@@ -174,8 +173,8 @@ def test_the_env_that_throughput_times_moves_on_every_device(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = DQNConfig(batch_size=32, replay_capacity=512, min_replay_size=16)
-    learner = Learner(probes.TwoSteps(), QNetwork((16,), (2,)), config, 8, 80)
-    assert learner.num_devices == 2
+    learner = DQN(probes.TwoSteps(), QNetwork((16,), (2,)), DQNSpec(config, 8, 80))
+    assert len(learner.spec.devices) == 2
     start = learner.init(0).env_state
     seen = np.asarray(start.obs)
     program = load("throughput", monkeypatch).env_program(learner, 1)

@@ -400,7 +400,7 @@ DOCUMENTED = sorted(
 )
 WANTED = (
     *("policy", "runtime", "env", "brax_training", "gym_envs", "config", "robots", "evaluation"),
-    *("dqn.learner", "engines.engine"),
+    *("dqn.dqn", "engines.engine"),
 )
 """Modules that the API pages must have."""
 

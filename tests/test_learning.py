@@ -58,10 +58,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     for _ in range(CALLS):
         state, raw = program(state)
         metrics.append({name: float(value) for name, value in raw.items()})
-    params = jax.device_get(learner.exported(state))
+    params = jax.device_get(learner.export_params(state))
     path = tmp_path_factory.mktemp("run") / "policy.safetensors"
     policy = save_policy(path, params, make_manifest(config, env.scene.hash, {}))
-    return Run(config, policy, in_order(state.replay.data, learner.num_devices), metrics)
+    return Run(config, policy, in_order(state.replay.data, len(learner.spec.devices)), metrics)
 
 
 def in_order(data: Any, devices: int) -> Any:

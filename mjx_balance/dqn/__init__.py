@@ -1,1 +1,6 @@
-"""A Deep Q-Network that knows no robot and trains on any discrete-action brax `Env`."""
+"""A Deep Q-Network for any brax `Env` with discrete actions; it knows no robot."""
+
+from mjx_balance.dqn.dqn import DQN, DQNSpec, TrainState
+from mjx_balance.dqn.networks import QNetwork
+
+__all__ = ["DQN", "DQNSpec", "QNetwork", "TrainState"]

@@ -50,7 +50,7 @@ class QNetwork(nn.Module):
         stretch = self.param("stretch", nn.initializers.zeros, (len(factors),))
         return heads.Radial(out, profile, stretch, factors)
 
-    def folded(self, params: Any, mean: jax.Array, matrix: jax.Array) -> Any:
+    def fold_whitening(self, params: Any, mean: jax.Array, matrix: jax.Array) -> Any:
         """Parameters that give for obs what `params` give for (obs - mean) @ matrix.
 
         Args:

@@ -1,31 +1,29 @@
-"""A uniform replay buffer as a frozen state and three pure functions.
+"""A uniform replay buffer as a frozen state and pure functions: `init`, `add`, `sample`.
 
 Transitions arrive in batches of a fixed size, one per env. The capacity is a
 whole number of batches, so a write is always one contiguous block and never
 wraps in its middle.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-
-T = TypeVar("T")
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 
 class Transition(NamedTuple):
     """One step of one env; in the buffer, every field has a leading capacity axis."""
 
-    obs: jax.Array
-    """(obs_size,)"""
-    action: jax.Array
-    """() index, int32"""
-    reward: jax.Array
-    """()"""
-    terminated: jax.Array
-    """() 1 after a true termination, 0 after a time-out: only the first stops bootstrapping."""
-    next_obs: jax.Array
-    """(obs_size,) the observation before any reset."""
+    obs: Float[Array, "*rows obs"]
+    action: Int[Array, "*rows"]
+    """Index, int32."""
+    reward: Float[Array, "*rows"]
+    terminated: Float[Array, "*rows"]
+    """1 after a termination, 0 after a time-out: only the first stops bootstrapping."""
+    next_obs: Float[Array, "*rows obs"]
+    """The observation before any reset."""
 
 
 class ReplayState(NamedTuple):
@@ -33,10 +31,10 @@ class ReplayState(NamedTuple):
 
     data: Transition
     """(capacity, ...) per field."""
-    position: jax.Array
-    """() row that the next batch starts at."""
-    size: jax.Array
-    """() rows that hold transitions."""
+    position: Int[Array, ""]
+    """Row at which the next batch starts."""
+    size: Int[Array, ""]
+    """Rows that hold transitions."""
 
 
 def init(example: Transition, capacity: int, batch: int) -> ReplayState:
@@ -44,7 +42,7 @@ def init(example: Transition, capacity: int, batch: int) -> ReplayState:
 
     Args:
       example: one transition, for shapes and dtypes.
-      capacity: rows wanted; rounded down to a whole number of batches.
+      capacity: rows; rounded down to a whole number of batches.
       batch: rows per `add`.
 
     Raises:
@@ -57,13 +55,16 @@ def init(example: Transition, capacity: int, batch: int) -> ReplayState:
     return ReplayState(data, jnp.int32(0), jnp.int32(0))
 
 
-def add(state: ReplayState, batch: Transition, wanted: jax.Array | bool = True) -> ReplayState:
+def add(state: ReplayState, batch: Transition, valid: Bool[Array, ""] | bool = True) -> ReplayState:
     """Overwrites the oldest rows with a batch.
 
     Args:
       state: the buffer.
       batch: (batch, ...) per field.
-      wanted: () if false, the buffer stays as it is.
+      valid: if false, the buffer stays as it is.
+
+    Raises:
+      ValueError: if the batch does not divide the capacity.
     """
     capacity = state.data.action.shape[0]
     rows = batch.action.shape[0]
@@ -72,22 +73,52 @@ def add(state: ReplayState, batch: Transition, wanted: jax.Array | bool = True) 
 
     def write(ring: jax.Array, new: jax.Array) -> jax.Array:
         old = jax.lax.dynamic_slice_in_dim(ring, state.position, rows, 0)
-        new = jnp.where(wanted, new, old)
+        new = jnp.where(valid, new, old)
         return jax.lax.dynamic_update_slice_in_dim(ring, new, state.position, 0)
 
     position = (state.position + rows) % capacity
     return ReplayState(
         jax.tree.map(write, state.data, batch),
-        jnp.where(wanted, position, state.position),
-        jnp.where(wanted, jnp.minimum(state.size + rows, capacity), state.size),
+        jnp.where(valid, position, state.position),
+        jnp.where(valid, jnp.minimum(state.size + rows, capacity), state.size),
     )
 
 
-def sample(state: ReplayState, key: jax.Array, batch_size: int) -> Transition:
-    """Draws transitions uniformly, with replacement; the buffer must not be empty.
-
-    Returns:
-      (batch_size, ...) per field.
-    """
+def sample(state: ReplayState, key: PRNGKeyArray, batch_size: int) -> Transition:
+    """Draws (batch_size, ...) transitions uniformly, with replacement, from a buffer not empty."""
     rows = jax.random.randint(key, (batch_size,), 0, state.size)
     return jax.tree.map(lambda ring: ring.at[rows].get(mode="promise_in_bounds"), state.data)
+
+
+class Symmetries(Protocol):
+    """The group of the env's reflections, g of them, the identity included."""
+
+    @property
+    def obs_index(self) -> Int[np.ndarray, "g obs"]:
+        """Entry of the observation that moves to each place."""
+        ...
+
+    @property
+    def obs_sign(self) -> Float[np.ndarray, "g obs"]:
+        """Its sign there."""
+        ...
+
+    @property
+    def action_index(self) -> Int[np.ndarray, "g actions"]:
+        """Index that each action becomes."""
+        ...
+
+
+def reflect(batch: Transition, symmetries: Symmetries, key: PRNGKeyArray) -> Transition:
+    """Replaces each transition of a batch by one of its reflections, chosen at random."""
+    which = jax.random.randint(key, batch.action.shape, 0, len(symmetries.obs_index))
+
+    def reflected(obs: jax.Array) -> jax.Array:
+        index = jnp.asarray(symmetries.obs_index)[which]
+        return jnp.take_along_axis(obs, index, axis=-1) * jnp.asarray(symmetries.obs_sign)[which]
+
+    return batch._replace(
+        obs=reflected(batch.obs),
+        next_obs=reflected(batch.next_obs),
+        action=jnp.asarray(symmetries.action_index)[which, batch.action],
+    )

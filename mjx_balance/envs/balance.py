@@ -1,12 +1,14 @@
 """`BalanceEnv`: one robot on one board, a brax environment with 441 or with continuous actions."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
 from mjx_balance.config import ACTION_AXES, Config, check, preset
+from mjx_balance.envs.metrics import Metric
 from mjx_balance.sim.engines.choice import make_engine
 from mjx_balance.sim.engines.engine import Engine, settled
 from mjx_balance.sim.scene import Scene, load_scene
@@ -30,6 +32,12 @@ class BalanceEnv(Env):
     Written for one board; `jax.vmap` it over thousands. For brax's own trainers:
     `brax_training.wrap`.
     """
+
+    metrics: ClassVar[Mapping[str, Metric]] = {
+        "tilt_deg": Metric(per_seed=True),
+        "fall": Metric("falls_per_minute", per="minute", per_seed=True),
+    }
+    """Metrics of `State.metrics` that are logged otherwise than as a mean under their own name."""
 
     def __init__(self, config: Config | None = None, action: str = "discrete"):
         """Builds the scene.

@@ -8,7 +8,7 @@ from typing import Any
 from tensorboardX import SummaryWriter
 
 from mjx_balance.config import Config, ConfigError, expand_runs, sweep_grid
-from mjx_balance.dqn.learner import Learner, TrainState
+from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.statistics import over_seeds
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
@@ -43,7 +43,7 @@ def check_fits(config: Config) -> None:
 
 def export(
     config: Config,
-    learner: Learner,
+    learner: DQN,
     scene_hash: str,
     folder: RunFolder,
     state: TrainState,

@@ -18,7 +18,8 @@ import numpy as np
 from tensorboardX import SummaryWriter
 
 from mjx_balance.config import Config, expand_runs
-from mjx_balance.dqn.learner import TrainState
+from mjx_balance.dqn import TrainState
+from mjx_balance.envs.metrics import Metric
 from mjx_balance.files.run_folder import RunFolder, keep_metrics_until, keep_validated_until
 from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints
@@ -26,8 +27,12 @@ from mjx_balance.training.processes import ALONE, Processes
 
 T = TypeVar("T")
 
-PER_SEED = ("tilt_deg", "falls_per_minute", "reward", "loss")
-"""Metrics that are also logged for every seed, where there are several."""
+LEARNER_METRICS = {
+    "reward": Metric(per_seed=True),
+    "loss": Metric(per_seed=True),
+    "diverged": Metric(per="call"),
+}
+"""The learner's own metrics; an env's table is added to them."""
 ANSWER_S = 0.2
 """Longest time that the user waits for an answer to an interrupt, s."""
 
@@ -56,6 +61,8 @@ class Plan(NamedTuple):
     """Decisions of one seed's envs between two validations; 0: never."""
     checkpoint_seconds: float
     """Time between two checkpoints, s."""
+    metrics: Mapping[str, Metric]
+    """Metrics that are logged otherwise than as a mean under their own name."""
 
     @property
     def per_call(self) -> int:
@@ -63,8 +70,8 @@ class Plan(NamedTuple):
         return self.iterations * self.num_envs
 
 
-def make_plan(config: Config) -> Plan:
-    """The plan of a run whose config is sized to its devices."""
+def make_plan(config: Config, metrics: Mapping[str, Metric]) -> Plan:
+    """The plan of a run whose config is sized to its devices, and whose env has these metrics."""
     assert config.num_envs is not None
     iterations = max(1, config.log_every // config.num_envs)
     per_call = iterations * config.num_envs
@@ -77,6 +84,7 @@ def make_plan(config: Config) -> Plan:
         sim_steps=config.task.sim_steps,
         eval_every=config.eval_every,
         checkpoint_seconds=config.checkpoint_seconds,
+        metrics=LEARNER_METRICS | dict(metrics),
     )
 
 
@@ -256,26 +264,31 @@ def number(count: jax.Array) -> int:
 def measured(
     raw: Mapping[str, np.ndarray], seconds: float, plan: Plan
 ) -> tuple[dict[str, float], dict[str, list[float | None]]]:
-    """What a call measured, under the names it is logged by.
+    """The metrics of a call under their logged names.
 
     Args:
-      raw: means over the call, one per seed if there are several; NaN where there was
-        nothing to measure, as the loss before the first update.
-      seconds: that it took.
+      raw: means over the call's decisions, one per seed if there are several; NaN without a
+        value, as the loss before the first update.
+      seconds: duration of the call.
       plan: of the run.
 
     Returns:
-      The `means`, and what is `listed` of `PER_SEED`.
+      The `means` of all metrics, and those per seed `listed`.
     """
-    values = {name: np.atleast_1d(np.asarray(value, float)) for name, value in raw.items()}
-    values["falls_per_minute"] = values.pop("fall") * 60 / plan.decision_s
-    if "diverged" in values:  # envs, not a share of the decisions
-        values["diverged"] *= plan.per_call
+    scale = {"decision": 1.0, "minute": 60 / plan.decision_s, "call": plan.per_call}
+    values: dict[str, np.ndarray] = {}
+    per_seed = {}
+    for name, value in raw.items():
+        metric = plan.metrics.get(name, Metric())
+        logged = metric.name or name
+        values[logged] = scale[metric.per] * np.atleast_1d(np.asarray(value, float))
+        if metric.per_seed:
+            per_seed[logged] = values[logged]
     metrics = {f"train/{name}": value for name, value in means(values).items()}
     rate = plan.num_seeds * plan.per_call / seconds
     metrics["perf/env_steps_per_second"] = rate
     metrics["perf/physics_steps_per_second"] = rate * plan.sim_steps
-    return metrics, listed({name: values[name] for name in PER_SEED})
+    return metrics, listed(per_seed)
 
 
 def means(values: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -19,7 +19,7 @@ from mjx_balance.config import (
     read_run_config,
     to_dict,
 )
-from mjx_balance.dqn.learner import Learner, TrainState
+from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import (
     RunFolder,
@@ -122,7 +122,7 @@ def train(
             return finish.finish(config, policies, folder, display, began)
 
 
-def _make(config: Config) -> tuple[Config, BalanceEnv, Learner]:
+def _make(config: Config) -> tuple[Config, BalanceEnv, DQN]:
     """The config, sized to the devices, its env and its learner, which fit into the memory."""
     most = None
     while True:
@@ -134,9 +134,9 @@ def _make(config: Config) -> tuple[Config, BalanceEnv, Learner]:
             sizing.check_memory(learner)
             return sized, env, learner
         except ConfigError:
-            if config.num_envs is not None or learner.num_envs <= sizing.CPU_ENVS:
+            if config.num_envs is not None or learner.spec.num_envs <= sizing.CPU_ENVS:
                 raise
-            most = learner.num_envs // 2
+            most = learner.spec.num_envs // 2
 
 
 def provenance(env: BalanceEnv) -> dict[str, Any]:
@@ -195,7 +195,7 @@ def _open_folder(
 
 def _learn(
     config: Config,
-    learner: Learner,
+    learner: DQN,
     folder: RunFolder,
     display: Display,
     stop: loop.Interrupts,
@@ -208,7 +208,7 @@ def _learn(
     Returns:
       The last state, and the seconds spent learning by this call.
     """
-    plan = loop.make_plan(config)
+    plan = loop.make_plan(config, BalanceEnv.metrics)
     program = learner.train_program(plan.iterations)
     compiling = display.phase("compiling (up to a minute the first time, seconds from then on)")
     with compiling, program_cache.mending_xla_cache(display.say):

@@ -21,8 +21,8 @@ from mjx_balance.config import (
     sweep_grid,
     to_dict,
 )
-from mjx_balance.dqn.learner import REPLICATED, Learner
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn import DQN, DQNSpec, QNetwork
+from mjx_balance.dqn.mesh import REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.policy.manifest import network_factors
@@ -190,34 +190,34 @@ def used_devices(num_devices: int) -> list[Any]:
     return found
 
 
-def make_learner(config: Config, env: BalanceEnv) -> Learner:
+def make_learner(config: Config, env: BalanceEnv) -> DQN:
     """The DQN for a config that `size_to_device` has completed."""
     assert config.num_envs is not None
     assert config.num_devices is not None
     runs = expand_runs(config)
-    swept = sweep_grid(config)[0]
-    return Learner(
-        env,
-        QNetwork(config.dqn.hidden_sizes, network_factors(config), config.dqn.head == "radial"),
-        config.dqn,
-        config.num_envs,
-        config.num_env_steps,
-        used_devices(config.num_devices),
-        len(runs),
-        env.symmetries,
-        env.action_factors,
-        env.reset_staggered,
-        {name: [getattr(own.dqn, name) for own in runs] for name in swept},
+    radial = config.dqn.head == "radial"
+    network = QNetwork(config.dqn.hidden_sizes, network_factors(config), radial)
+    spec = DQNSpec(
+        config=config.dqn,
+        num_envs=config.num_envs,
+        num_env_steps=config.num_env_steps,
+        devices=used_devices(config.num_devices),
+        num_seeds=len(runs),
+        symmetries=env.symmetries,
+        action_factors=env.action_factors,
+        first_reset=env.reset_staggered,
+        sweep={name: [getattr(run.dqn, name) for run in runs] for name in sweep_grid(config)[0]},
     )
+    return DQN(env, network, spec)
 
 
-def check_memory(learner: Learner) -> None:
+def check_memory(learner: DQN) -> None:
     """Refuses a run that would not fit into a device or into this machine, before it allocates.
 
     Raises:
       ConfigError: with the estimate.
     """
-    needed = device_bytes(learner)
+    spec, needed = learner.spec, device_bytes(learner)
     device = learner.mesh.devices.ravel()[0]
     if device.platform == "cpu":
         mine = [x for x in learner.mesh.devices.ravel() if x.process_index == jax.process_index()]
@@ -229,23 +229,23 @@ def check_memory(learner: Learner) -> None:
     needed += PROGRAM_BYTES
     if needed > available:
         raise ConfigError(
-            f"{learner.num_seeds} runs with num_envs {learner.num_envs} and replay_capacity "
-            f"{learner.config.replay_capacity} take about {needed / 2**30:.1f} GiB of {where}, and "
+            f"{spec.num_seeds} runs with num_envs {spec.num_envs} and replay_capacity "
+            f"{spec.config.replay_capacity} take about {needed / 2**30:.1f} GiB of {where}, and "
             f"{available / 2**30:.1f} GiB are free; lower num_envs, replay_capacity or the number "
             "of runs"
         )
 
 
-def device_bytes(learner: Learner) -> float:
+def device_bytes(learner: DQN) -> float:
     """Memory that a run takes on each of its devices, besides its program."""
     shapes = jax.eval_shape(lambda: learner.init(0))
 
     def own(spec: PartitionSpec, part: Any) -> float:
         whole = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(part))
-        return whole if spec == REPLICATED else whole / learner.num_devices
+        return whole if spec == REPLICATED else whole / len(learner.spec.devices)
 
-    state = sum(jax.tree.leaves(jax.tree.map(own, learner.specs, shapes)))
-    envs = learner.num_seeds * learner.num_envs / learner.num_devices
+    state = sum(jax.tree.leaves(jax.tree.map(own, learner.state_specs, shapes)))
+    envs = learner.spec.num_seeds * learner.spec.per_device(learner.spec.num_envs)
     return STATE_COPIES * state + ENV_BYTES * envs
 
 

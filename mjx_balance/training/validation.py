@@ -14,8 +14,8 @@ import jax
 import numpy as np
 
 from mjx_balance.config import Config, expand_runs
-from mjx_balance.dqn.learner import Learner, TrainState
-from mjx_balance.dqn.updating import Params
+from mjx_balance.dqn import DQN, TrainState
+from mjx_balance.dqn.dqn import Params
 from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import RunFolder
@@ -47,7 +47,7 @@ def scalars(results: Results) -> dict[str, float]:
 
 
 def exports(
-    config: Config, learner: Learner, scene_hash: str, state: TrainState
+    config: Config, learner: DQN, scene_hash: str, state: TrainState
 ) -> Iterator[tuple[Params, dict[str, Any]]]:
     """Weights and manifest of every seed's greedy policy.
 
@@ -69,11 +69,11 @@ def exports(
     runs = expand_runs(config)
     for k, own in enumerate(runs):
         mine = jax.tree.map(lambda x: x[k], known) if len(runs) > 1 else known  # noqa: B023
-        yield jax.device_get(learner.exported(mine)), make_manifest(own, scene_hash, training)
+        yield jax.device_get(learner.export_params(mine)), make_manifest(own, scene_hash, training)
 
 
 def validate(
-    config: Config, learner: Learner, scene: Scene, folder: RunFolder, state: TrainState
+    config: Config, learner: DQN, scene: Scene, folder: RunFolder, state: TrainState
 ) -> dict[str, np.ndarray]:
     """Validates every seed's greedy policy and keeps it; changes nothing of the state.
 

@@ -47,7 +47,7 @@ def test_a_ratio_that_makes_no_whole_number_of_updates_is_refused() -> None:
 
 def test_a_learning_rate_alone_changes_no_schedule() -> None:
     """The paper's rate is constant, whatever it is."""
-    from mjx_balance.dqn.learner import make_optimizer
+    from mjx_balance.dqn.dqn import make_optimizer
 
     config = with_dqn(preset("paper"), learning_rate=1e-3, max_grad_norm=1e9)
     optimizer = make_optimizer(config.dqn, 10)

@@ -1,7 +1,8 @@
 """NaN and infinity, from wherever they come, stop neither the training nor what it learns."""
 
-import dataclasses
+import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,20 +12,16 @@ import probes
 import pytest
 from brax.envs.base import Env
 
-from mjx_balance.dqn import replay
-from mjx_balance.dqn.collecting import collect
-from mjx_balance.dqn.devices import AXIS
-from mjx_balance.dqn.learner import Learner
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn import DQN
+from mjx_balance.dqn.dqn import step
+from mjx_balance.dqn.mesh import AXIS
 
-CONFIG = dataclasses.replace(probes.CONFIG, whiten_steps=1_600)
 ENVS, ITERATIONS = 8, 500
 
 
-def make(env: Env, num_seeds: int = 1, **changes: Any) -> Learner:
-    config = dataclasses.replace(CONFIG, **changes)
-    network = QNetwork(config.hidden_sizes, (2,))
-    return Learner(env, network, config, ENVS, ENVS * ITERATIONS, num_seeds=num_seeds)
+@pytest.fixture(scope="module")
+def make(make_dqn: Callable[..., DQN]) -> Callable[..., DQN]:
+    return functools.partial(make_dqn, iterations=ITERATIONS, whiten_steps=1_600)
 
 
 def assert_finite(tree: Any) -> None:
@@ -34,42 +31,46 @@ def assert_finite(tree: Any) -> None:
 
 def learnt(state: Any) -> Any:
     """All that must stay finite, and is kept from step to step."""
-    return state.params, state.target_params, state.opt_state, state.inputs, state.replay
+    return state.params, state.target_params, state.opt_state, state.statistics, state.replay
 
 
-def assert_learnt(learner: Learner, state: Any) -> None:
+def assert_learnt(dqn: DQN, state: Any) -> None:
     """Actions of a step are worth -x and x, whatever happens to other steps."""
     assert_finite(learnt(state))
-    raw = learner.exported(state)
+    raw = dqn.export_params(state)
     for x in (-0.7, 0.6):
-        q_values = learner.network.apply(raw, jnp.asarray((x, 1.0)))
+        q_values = dqn.network.apply(raw, jnp.asarray((x, 1.0)))
         np.testing.assert_allclose(np.asarray(q_values), (-x, x), atol=0.15)
 
 
-def test_training_ends_in_good_values() -> None:
+def test_training_ends_in_good_values(make: Callable[..., DQN]) -> None:
     faults = {"obs": math.nan, "reward": math.inf, "done": math.nan, "reset": -math.inf}
-    learner = make(probes.Faulty(faults, 0.03))
-    state, metrics = learner.train_program(ITERATIONS)(learner.init(0))
-    assert_learnt(learner, state)
+    dqn = make(probes.Faulty(faults, 0.03))
+    state, metrics = dqn.train_program(ITERATIONS)(dqn.init(0))
+    assert_learnt(dqn, state)
     assert metrics["diverged"] == pytest.approx(1 - 0.97**4, abs=0.02)
     assert metrics["skipped_updates"] == 0
     assert metrics["mine"] == 1
     assert abs(float(metrics["reward"])) < 1
 
 
-def test_observations_whose_squares_are_beyond_numbers_spoil_no_statistics() -> None:
-    learner = make(probes.Faulty({"reset": 1e30}, 0.02))
-    state, metrics = learner.train_program(ITERATIONS)(learner.init(0))
-    assert_learnt(learner, state)
+def test_observations_whose_squares_are_beyond_numbers_spoil_no_statistics(
+    make: Callable[..., DQN],
+) -> None:
+    dqn = make(probes.Faulty({"reset": 1e30}, 0.02))
+    state, metrics = dqn.train_program(ITERATIONS)(dqn.init(0))
+    assert_learnt(dqn, state)
     assert metrics["diverged"] == 0
-    assert 50 < float(state.inputs.batches) < 195, "of 200 batches, those without such a number"
+    assert 50 < float(state.statistics.batches) < 195, "of 200 batches, those without such a number"
 
 
-def test_rewards_too_great_to_be_squared_cost_the_updates_that_meet_them() -> None:
+def test_rewards_too_great_to_be_squared_cost_the_updates_that_meet_them(
+    make: Callable[..., DQN],
+) -> None:
     """One row in 200 is one batch in seven: it is skipped, and counted, and the rest learns."""
-    learner = make(probes.Faulty({"reward": 1e30}, 0.005), whiten_steps=0)
-    state, metrics = learner.train_program(ITERATIONS)(learner.init(0))
-    assert_learnt(learner, state)
+    dqn = make(probes.Faulty({"reward": 1e30}, 0.005), whiten_steps=0)
+    state, metrics = dqn.train_program(ITERATIONS)(dqn.init(0))
+    assert_learnt(dqn, state)
     skipped = float(metrics["skipped_updates"])
     assert 0.05 < skipped < 0.4
     # 16 rows of each device are wanted in all, 8 of each: the second iteration is the first.
@@ -77,12 +78,12 @@ def test_rewards_too_great_to_be_squared_cost_the_updates_that_meet_them() -> No
     assert int(state.gradient_steps) == asked - round(skipped * 2 * ITERATIONS)
 
 
-def test_one_seed_of_several_leaves_the_others_alone() -> None:
+def test_one_seed_of_several_leaves_the_others_alone(make: Callable[..., DQN]) -> None:
     """The parameters of the second are not numbers: the first never knows."""
-    learner = make(probes.NoisyState(), num_seeds=2)
-    program = learner.train_program(20)
-    sound, _ = program(learner.init(0))
-    state = learner.init(0)
+    dqn = make(probes.NoisyState(), num_seeds=2)
+    program = dqn.train_program(20)
+    sound, _ = program(dqn.init(0))
+    state = dqn.init(0)
     spoilt = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.params)
     state, metrics = program(state._replace(params=spoilt))
     for a, b in zip(
@@ -97,12 +98,12 @@ def test_one_seed_of_several_leaves_the_others_alone() -> None:
 
 
 def stepped(env: Env, obs: list[list[float]], action: list[int]) -> Any:
-    """What `collect` makes of envs at these observations, on each of two devices alike."""
+    """What `step` makes of envs at these observations, on each of two devices alike."""
     state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), len(obs)))
     state = state.replace(obs=jnp.asarray(obs))
 
     def one(key: jax.Array) -> Any:
-        return collect(env, state, jnp.asarray(action, jnp.int32), key)
+        return step(env, state, jnp.asarray(action, jnp.int32), key)
 
     keys = jnp.stack([jax.random.PRNGKey(1)] * 2)
     return jax.device_get(jax.jit(jax.vmap(one, axis_name=AXIS))(keys))
@@ -111,7 +112,7 @@ def stepped(env: Env, obs: list[list[float]], action: list[int]) -> Any:
 def test_a_diverged_env_is_reset_and_its_row_is_another_envs() -> None:
     env = probes.Faulty({"reward": math.nan}, 1.0)
     got = stepped(env, [[0.1, 1.0], [0.2, 0.0], [0.3, 1.0], [0.4, 0.0]], [0, 1, 1, 0])
-    assert got.storable.all()
+    assert got.valid.all()
     np.testing.assert_allclose(got.transition.obs[0, :, 0], (0.2, 0.2, 0.2, 0.4))
     np.testing.assert_array_equal(got.transition.action[0], (1, 1, 1, 0))
     np.testing.assert_allclose(got.transition.reward[0], (0.2, 0.2, 0.2, -0.4))
@@ -123,7 +124,7 @@ def test_a_diverged_env_is_reset_and_its_row_is_another_envs() -> None:
 def test_where_no_row_is_finite_none_is_stored() -> None:
     env = probes.Faulty({"obs": math.inf}, 1.0)
     got = stepped(env, [[0.1, 1.0], [0.2, 1.0]], [0, 1])
-    assert not got.storable.any()
+    assert not got.valid.any()
     assert got.metrics["diverged"].value()[0] == 1
     assert got.metrics["reward"].number[0] == 0
 
@@ -159,24 +160,13 @@ def test_what_the_env_reports_as_diverged_is_counted_with_what_is_found() -> Non
     assert got.metrics["diverged"].value()[0] == pytest.approx(3 / 5)
 
 
-def test_all_envs_diverging_at_once_is_no_end() -> None:
+def test_all_envs_diverging_at_once_is_no_end(make: Callable[..., DQN]) -> None:
     """Nothing is ever stored, nothing learnt, and nothing breaks."""
-    learner = make(probes.Faulty({"reward": math.nan}, 1.0))
-    start = jax.device_get(learner.init(0))
-    state, metrics = learner.train_program(3)(learner.init(0))
+    dqn = make(probes.Faulty({"reward": math.nan}, 1.0))
+    start = jax.device_get(dqn.init(0))
+    state, metrics = dqn.train_program(3)(dqn.init(0))
     assert int(state.replay.size) == int(state.replay.position) == 0
     assert int(state.env_steps) == 3 * ENVS
     jax.tree.map(np.testing.assert_array_equal, start.params, jax.device_get(state.params))
     assert metrics["diverged"] == 1
     assert np.isnan(metrics["loss"])
-
-
-def test_a_batch_that_is_not_wanted_changes_nothing() -> None:
-    example = replay.Transition(*map(jnp.asarray, ([0.0], 0, 0.0, 0.0, [0.0])))
-    state = replay.init(example, 6, 2)
-    for k in range(8):
-        rows = jax.tree.map(lambda x, k=k: jnp.stack((x + k, x + k)), example)
-        after = replay.add(state, rows, jnp.bool_(False))
-        jax.tree.map(np.testing.assert_array_equal, state, after)
-        state = replay.add(state, rows, jnp.bool_(True))
-    assert sorted(np.asarray(state.data.action).tolist()) == [5, 5, 6, 6, 7, 7]

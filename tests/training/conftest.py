@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import pytest
 
 from mjx_balance.config import preset
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn import QNetwork
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.task.observation import observation_names
 
@@ -91,7 +91,7 @@ class StubLearner:
         self.params: Any = self.network.init(jax.random.PRNGKey(0), jnp.zeros(self.obs_size))
         self.first_weight = float(self.params["params"]["hidden_0"]["kernel"].ravel()[0])
 
-    def exported(self, state: StubState) -> Any:
+    def export_params(self, state: StubState) -> Any:
         """The parameters."""
         assert state.env_state is None  # may be gigabytes
         assert state.replay is None

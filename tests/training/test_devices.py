@@ -13,8 +13,8 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from mjx_balance.config import ConfigError, preset
-from mjx_balance.dqn.devices import AXIS
-from mjx_balance.dqn.learner import REPLICATED
+from mjx_balance.dqn import DQNSpec
+from mjx_balance.dqn.mesh import AXIS, REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.training import program_cache, run, sizing
 from mjx_balance.training.sizing import check_memory, explained, make_learner, size_to_device
@@ -168,23 +168,24 @@ def test_the_learner_is_the_configs(head: Any, factors: tuple[int, ...]) -> None
     network = learner.network
     assert (network.hidden_sizes, network.factors) == ((8, 4), factors)
     assert network.radial == (head == "radial")
-    assert (learner.env, learner.config) == (env, dqn)
-    assert (learner.num_envs, learner.num_devices, learner.num_seeds) == (32, 1, 3)
-    assert learner.action_factors == (21, 21)
-    assert learner.symmetries is not None
-    assert learner.first_reset == env.reset_staggered
+    spec = learner.spec
+    assert (learner.env, spec.config) == (env, dqn)
+    assert (spec.num_envs, len(spec.devices), spec.num_seeds) == (32, 1, 3)
+    assert spec.action_factors == (21, 21)
+    assert spec.symmetries is not None
+    assert spec.first_reset == env.reset_staggered
     # 10 decisions of 32 envs, each transition replayed 512 times in batches of 256.
-    assert learner.total_updates == 640
-    assert learner.sweep == {}
+    assert spec.total_updates == 640
+    assert spec.sweep == {}
 
 
 def test_a_sweep_is_told_to_the_learner() -> None:
     config = with_batch(
         512, num_envs=32, num_devices=1, num_seeds=2, sweep=("gamma=0,0.5", "huber_delta=1,2")
     )
-    learner = make_learner(config, BalanceEnv(config))
-    assert learner.num_seeds == 8
-    assert {name: values.tolist() for name, values in learner.sweep.items()} == {
+    spec = make_learner(config, BalanceEnv(config)).spec
+    assert spec.num_seeds == 8
+    assert spec.sweep == {
         "gamma": [0, 0, 0, 0, 0.5, 0.5, 0.5, 0.5],
         "huber_delta": [1, 1, 2, 2, 1, 1, 2, 2],
     }
@@ -196,13 +197,11 @@ MIB = 2**20
 class Learner:
     """8 MiB that every device has, and 4 MiB shared out; 2 runs of 64 envs."""
 
-    num_seeds, num_envs = 2, 64
-    config = CONFIG.dqn
-
     def __init__(self, *devices: Any) -> None:
-        self.specs = {"parameters": REPLICATED, "replay": PartitionSpec(None, AXIS)}
+        dqn = dataclasses.replace(CONFIG.dqn, mirror=False)
+        self.spec = DQNSpec(dqn, 64, 64, devices, num_seeds=2)
+        self.state_specs = {"parameters": REPLICATED, "replay": PartitionSpec(None, AXIS)}
         self.mesh = types.SimpleNamespace(devices=np.asarray(devices))
-        self.num_devices = len(devices)
 
     def init(self, seed: int) -> Any:
         rows = {"a": jnp.zeros((MIB // 2,), jnp.float32), "b": jnp.zeros((2 * MIB,), jnp.int8)}
@@ -272,10 +271,11 @@ def test_envs_that_nobody_asked_for_are_halved_until_they_fit(
     """2,048 for 64 runs are too many here; 512 that somebody asked for are refused."""
 
     def check(learner: Any) -> None:
-        if learner.num_envs > 300:
+        if learner.spec.num_envs > 300:
             raise ConfigError("too much")
 
-    monkeypatch.setattr(sizing, "make_learner", lambda config, env: config)
+    with_spec = lambda config, env: types.SimpleNamespace(spec=config)  # noqa: E731
+    monkeypatch.setattr(sizing, "make_learner", with_spec)
     monkeypatch.setattr(sizing, "check_memory", check)
     sized, *_ = run._make(CONFIG)
     assert (sized.num_envs, sized.num_env_steps, sized.dqn.batch_size) == (256, 40_000, 256)

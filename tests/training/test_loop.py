@@ -23,11 +23,12 @@ from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event
 
 from mjx_balance.config import PRESETS, Config, TaskConfig
+from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints, loop
 from mjx_balance.training import run as run_module
-from mjx_balance.training.loop import Interrupts, Plan, learn, make_plan, measured
+from mjx_balance.training.loop import LEARNER_METRICS, Interrupts, Plan, learn, make_plan, measured
 from mjx_balance.training.program_cache import program_key
 
 PLAN = Plan(
@@ -39,6 +40,7 @@ PLAN = Plan(
     sim_steps=50,
     eval_every=0,
     checkpoint_seconds=1e9,
+    metrics=LEARNER_METRICS | dict(BalanceEnv.metrics),
 )
 RAW = {"fall": 0.02, "tilt_deg": 0.5, "reward": 0.3, "loss": 0.25, "epsilon": 0.1}
 
@@ -102,14 +104,14 @@ def logged(folder: RunFolder) -> list[dict[str, Any]]:
 
 def test_a_plan_rounds_the_run_up_to_whole_calls() -> None:
     config = Config(num_envs=64, num_env_steps=1_000, log_every=300, num_seeds=3, eval_every=500)
-    plan = make_plan(config)
+    plan = make_plan(config, {})
     assert (plan.iterations, plan.per_call, plan.total) == (4, 256, 1024)
     assert (plan.num_envs, plan.num_seeds) == (64, 3)
     assert (plan.decision_s, plan.sim_steps, plan.checkpoint_seconds) == (0.2, 50, 45)
     assert plan.eval_every == 500
-    rare = make_plan(Config(num_envs=64, num_env_steps=1_024, log_every=1))
+    rare = make_plan(Config(num_envs=64, num_env_steps=1_024, log_every=1), {})
     assert (rare.iterations, rare.total) == (1, 1024)  # at least one decision a call
-    other = make_plan(Config(num_envs=8, task=TaskConfig(ctrl_dt=0.1, sim_dt=0.002)))
+    other = make_plan(Config(num_envs=8, task=TaskConfig(ctrl_dt=0.1, sim_dt=0.002)), {})
     assert (other.decision_s, other.sim_steps) == (0.1, 50)
 
 

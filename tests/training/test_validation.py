@@ -16,8 +16,7 @@ from rich.console import Console
 
 from mjx_balance import load_policy
 from mjx_balance.config import preset
-from mjx_balance.dqn.learner import Learner
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.suites import SEEDS
 from mjx_balance.files.run_folder import RunFolder
@@ -199,8 +198,7 @@ class Blind(Env):
     def reset(self, rng: jax.Array) -> State:
         zero = jnp.float32(0.0)
         obs = jax.random.normal(rng, (self.size,))
-        metrics = {"tilt_deg": zero, "fall": zero}
-        return State(None, obs, zero, zero, metrics, {"truncation": zero})
+        return State(None, obs, zero, zero, {}, {"truncation": zero})
 
     def step(self, state: State, action: jax.Array) -> State:
         reward = jnp.float32(action < 220)
@@ -216,17 +214,9 @@ def test_learning_is_the_same_bit_for_bit_with_and_without_validation(
     config = dataclasses.replace(SHORT, num_seeds=2, num_envs=16, num_env_steps=192, log_every=64)
     config = dataclasses.replace(config, dqn=dqn)
     network = QNetwork((8,), (21, 21), radial=True)
-    learner = Learner(
-        Blind(stub_learner.obs_size),
-        network,
-        dqn,
-        16,
-        192,
-        jax.devices(),
-        2,
-        action_factors=(21, 21),
-    )
-    program = learner.train_program(4)
+    spec = DQNSpec(dqn, 16, 192, num_seeds=2, action_factors=(21, 21))
+    learner = DQN(Blind(stub_learner.obs_size), network, spec)
+    program: Any = learner.train_program(4)
     calls: list[int] = []
 
     def trained(eval_every: int) -> Any:
@@ -237,7 +227,7 @@ def test_learning_is_the_same_bit_for_bit_with_and_without_validation(
             calls.append(eval_every)
             return validate(config, learner, scene, folder, state)
 
-        plan = loop.make_plan(dataclasses.replace(config, eval_every=eval_every))
+        plan = loop.make_plan(dataclasses.replace(config, eval_every=eval_every), {})
         display = finish.Display(Console(file=io.StringIO()))
         with Interrupts(pytest.fail) as stop:
             state, _ = loop.learn(plan, program, learner.init(3), folder, display, stop, counted)
@@ -248,7 +238,7 @@ def test_learning_is_the_same_bit_for_bit_with_and_without_validation(
     assert (str(np.random.get_state()), random.getstate()) == global_numbers
     assert calls == [64] * 3
     assert with_.gradient_steps.tolist() == without.gradient_steps.tolist() != [0, 0]
-    assert learner.trace_count == 1
+    assert program._cache_size() == 1
     first, second = (jax.tree.leaves_with_path(state) for state in (with_, without))
     assert len(first) == len(second) > 20
     for (path, a), (_, b) in zip(first, second, strict=True):

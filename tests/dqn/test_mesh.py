@@ -10,14 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import PartitionSpec
 
 from mjx_balance.config import DQNConfig
-from mjx_balance.dqn.devices import AXIS
-from mjx_balance.dqn.learner import Learner
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn import DQN, DQNSpec, QNetwork, normalization
+from mjx_balance.dqn.dqn import UpdateState, make_optimizer
+from mjx_balance.dqn.mesh import AXIS, REPLICATED, on_each_device
 from mjx_balance.dqn.replay import Transition
-from mjx_balance.dqn.updating import LearnerState, make_optimizer, update
 
 DEVICES = 4
 UPDATES = 50
@@ -36,38 +35,39 @@ def elsewhere() -> Iterator[Executor]:
 
 def learnt(devices: int) -> list[np.ndarray]:
     """Parameters after updates on one global batch each, shared out over so many devices."""
-    network = QNetwork((8,), (3,), radial=False)
-    config = DQNConfig(batch_size=8, learning_rate=1e-2, target_update_period=7, gamma=0.5)
-    optimizer = make_optimizer(config, UPDATES)
+    config = DQNConfig(
+        batch_size=8, replay_ratio=1, learning_rate=1e-2, target_update_period=7, gamma=0.5
+    )
+    network = QNetwork((8,), (3,))
+    spec = DQNSpec(config, 8, 8 * UPDATES, devices=jax.devices()[:devices])
+    dqn = DQN(probes.OneStep(), network, spec)
     rng = np.random.default_rng(0)
     obs, next_obs = jnp.asarray(rng.normal(size=(2, UPDATES, 8, 4)), jnp.float32)
     action = jnp.asarray(rng.integers(3, size=(UPDATES, 8)))
     reward = jnp.asarray(rng.normal(size=(UPDATES, 8)), jnp.float32)
     rows = Transition(obs, action, reward, jnp.zeros((UPDATES, 8)), next_obs)
     params = network.init(jax.random.PRNGKey(0), obs[0, 0])
-    start = LearnerState(params, params, optimizer.init(params), jnp.int32(0))
+    optimizer = make_optimizer(config, spec.total_updates)
+    start = UpdateState(params, params, optimizer.init(params), jnp.int32(0))
+    statistics = normalization.init(4, 1.0)
 
-    def q_values(params: Any, obs: jax.Array) -> Any:
-        return network.apply(params, obs, method="head")
+    def step(state: UpdateState, share: Transition) -> tuple[UpdateState, None]:
+        return dqn.update(state, share, statistics, config)[0], None
 
-    def step(state: LearnerState, share: Transition) -> tuple[LearnerState, None]:
-        return update(state, share, q_values, lambda x: x, optimizer, config)[0], None
+    def program(shares: Transition) -> Any:
+        return jax.lax.scan(step, start, shares)[0].params
 
-    program = jax.shard_map(
-        lambda shares: jax.lax.scan(step, start, shares)[0].params,
-        mesh=Mesh(np.asarray(jax.devices()[:devices]), (AXIS,)),
-        in_specs=PartitionSpec(None, AXIS),
-        out_specs=PartitionSpec(),
-        check_vma=False,
-    )
-    return jax.tree.leaves(jax.device_get(jax.jit(program)(rows)))
+    sharded = PartitionSpec(None, AXIS)
+    shared = on_each_device(program, dqn.mesh, sharded, REPLICATED)
+    return jax.tree.leaves(jax.device_get(jax.jit(shared)(rows)))
 
 
 def walked(devices: int) -> Any:
     """What 64 envs that act at random stored, (devices, decisions, envs of each, ...)."""
     config = DQNConfig(replay_capacity=512, epsilon_start=1.0, epsilon_end=1.0, hidden_sizes=(4,))
-    learner = Learner(probes.Walk(), QNetwork((4,), (2,)), config, 64, 512, jax.devices()[:devices])
-    state, _ = learner.train_program(8)(learner.init(0))
+    spec = DQNSpec(config, 64, 512, devices=jax.devices()[:devices])
+    dqn = DQN(probes.Walk(), QNetwork((4,), (2,)), spec)
+    state, _ = dqn.train_program(8)(dqn.init(0))
     data = jax.device_get(state.replay.data)
     return jax.tree.map(lambda x: x.reshape(devices, 8, 64 // devices, *x.shape[1:]), data)
 
@@ -82,7 +82,7 @@ def test_a_batch_makes_the_same_updates_however_many_devices_share_it(elsewhere:
 
 
 @pytest.mark.parametrize("devices", [2, DEVICES])
-def test_devices_draw_other_keys_and_store_other_boards(elsewhere: Executor, devices: int) -> None:
+def test_devices_draw_other_keys_and_store_other_envs(elsewhere: Executor, devices: int) -> None:
     """Every walk has a number: no device knows one of another's, and no two envs act alike."""
     data = elsewhere.submit(walked, devices).result()
     walks = [set(np.ravel(own[..., 0])) for own in data.obs]

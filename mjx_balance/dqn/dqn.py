@@ -1,0 +1,556 @@
+"""A Deep Q-Network as one jitted program: act, step, store, sample, update, copy.
+
+Mnih et al. 2015, https://www.nature.com/articles/nature14236, for thousands of envs at once: one
+iteration takes one decision of every env and makes the updates that the replay ratio asks for.
+Read `DQN.iteration` first.
+
+Envs and replay are sharded over a one-axis device mesh, parameters are replicated: each device
+steps its own envs, fills its own part of the replay and samples its own share of every batch;
+gradients are averaged. The devices are CPU cores or accelerators; the program is the same.
+
+Several seeds are several runs in one program: every array of the state gets a leading seed axis
+and the iteration is vmapped over it.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from brax.envs.base import Env, State
+from jax.sharding import AxisType, Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from mjx_balance.config import DQNConfig
+from mjx_balance.dqn import normalization, replay
+from mjx_balance.dqn.mesh import (
+    AXIS,
+    REPLICATED,
+    Mean,
+    all_finite,
+    device_key,
+    mean_over_devices,
+    mean_where,
+    on_each_device,
+)
+from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn.normalization import RunningStatistics
+from mjx_balance.dqn.replay import ReplayState, Symmetries, Transition
+from mjx_balance.policy.heads import Head
+
+Params: TypeAlias = Any
+"""A network's variables, a flax pytree."""
+Reset: TypeAlias = Callable[[jax.Array], State]
+"""PRNG key -> a fresh env."""
+Means: TypeAlias = dict[str, Mean]
+
+
+@dataclasses.dataclass(frozen=True)
+class DQNSpec:
+    """The numbers of a run.
+
+    Raises:
+      ValueError: if num_envs or batch_size cannot be split over the devices, if there are no
+        symmetries to mirror with, or if a swept field has another number of values than runs.
+    """
+
+    config: DQNConfig
+    """The algorithm."""
+    num_envs: int
+    """Envs over all devices."""
+    num_env_steps: int
+    """Decisions of the run over all envs, for the learning rate's schedule."""
+    devices: Sequence[Any] = dataclasses.field(default_factory=jax.devices)
+    """The mesh."""
+    num_seeds: int = 1
+    """Independent runs in one program."""
+    symmetries: Symmetries | None = None
+    """Reflections of the env, for `config.mirror`."""
+    action_factors: tuple[int, ...] | None = None
+    """Sizes of the digits of an action index, along which exploration noise moves it; None: one
+    digit."""
+    first_reset: Reset | None = None
+    """Makes the envs at the start of a run; None: the env's own reset."""
+    sweep: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
+    """Field of `config` -> its value in every run."""
+
+    def __post_init__(self) -> None:
+        num_devices = len(self.devices)
+        for name, value in (("num_envs", self.num_envs), ("batch_size", self.config.batch_size)):
+            if value % num_devices:
+                raise ValueError(
+                    f"{name} is {value}; it must be a multiple of the {num_devices} devices"
+                )
+        if self.config.mirror and self.symmetries is None:
+            raise ValueError("mirror is True, but no symmetries are given to mirror with")
+        for name, values in self.sweep.items():
+            if len(values) != self.num_seeds or self.num_seeds == 1:
+                raise ValueError(f"{name} has {len(values)} values for {self.num_seeds} runs")
+
+    @property
+    def updates_per_iteration(self) -> int:
+        """Gradient steps after each decision of all envs."""
+        return self.config.updates_per_step(self.num_envs)
+
+    @property
+    def total_updates(self) -> int:
+        """Gradient steps of the whole run; the last iteration counts whole."""
+        return -(-self.num_env_steps // self.num_envs) * self.updates_per_iteration
+
+    def per_device(self, count: int) -> int:
+        """One device's share of a count over all devices."""
+        return count // len(self.devices)
+
+
+class TrainState(NamedTuple):
+    """The whole state of a run: saving it saves the run.
+
+    With several seeds, every leaf has a leading axis of that size.
+    """
+
+    params: Params
+    """Of a network that takes whitened observations, with `whiten_steps`."""
+    target_params: Params
+    """Of a network that takes raw observations: a copy keeps the whitening of its time."""
+    opt_state: optax.OptState
+    statistics: RunningStatistics
+    """Of the observations."""
+    env_state: State
+    """(num_envs, ...) per leaf, sharded."""
+    replay: ReplayState
+    """Data sharded; position and size count one device's rows."""
+    env_steps: Int[Array, ""]
+    """Decisions over all envs."""
+    gradient_steps: Int[Array, ""]
+    key: PRNGKeyArray
+    """The same on every device."""
+    sweep: dict[str, Float[Array, ""]]
+    """Value of each swept field of the config."""
+
+
+class UpdateState(NamedTuple):
+    """The part of the training state that an update changes."""
+
+    params: Params
+    target_params: Params
+    opt_state: optax.OptState
+    gradient_steps: Int[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class DQN:
+    """Trains a Q-network on a brax env.
+
+    Args:
+      env: unbatched, with `action_size` discrete actions; `info["truncation"]`, if there,
+        marks time-outs.
+      network: maps (..., obs_size) to (..., action_size).
+      spec: the numbers of the run.
+    """
+
+    env: Env
+    network: QNetwork
+    spec: DQNSpec
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The device mesh of the program."""
+        return Mesh(np.asarray(self.spec.devices), (AXIS,), axis_types=(AxisType.Auto,))
+
+    @property
+    def state_specs(self) -> TrainState:
+        """Which arrays of the state are sharded over the devices."""
+        sharded = PartitionSpec(None, AXIS) if self.spec.num_seeds > 1 else PartitionSpec(AXIS)
+        specs: dict[str, Any] = dict.fromkeys(TrainState._fields, REPLICATED)
+        replay_specs: list[Any] = [sharded, REPLICATED, REPLICATED]
+        return TrainState(**specs | {"env_state": sharded, "replay": ReplayState(*replay_specs)})
+
+    def init(self, seed: int) -> TrainState:
+        """The state of a new run, or of runs `seed`, `seed + 1`, ..., on its devices."""
+        seeds = np.arange(seed, seed + self.spec.num_seeds, dtype=np.int32)
+        sweep = {name: np.asarray(x, np.float32) for name, x in self.spec.sweep.items()}
+        return self._init_program(seeds if self.spec.num_seeds > 1 else seeds[0], sweep)
+
+    @cached_property
+    def _init_program(self) -> Callable[[np.ndarray, Mapping[str, np.ndarray]], TrainState]:
+        def init(seed: jax.Array, sweep: dict[str, jax.Array]) -> TrainState:
+            return self.initial_state(jax.random.PRNGKey(seed), sweep)
+
+        init = self._each_seed(init)
+        return jax.jit(on_each_device(init, self.mesh, REPLICATED, self.state_specs))
+
+    def train_program(
+        self, iterations: int
+    ) -> Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]:
+        """The jitted training program: state -> (state, metrics), the state donated.
+
+        Metrics are means over the call, with a leading seed axis if there are several seeds; NaN
+        without a value, as the loss of a call without an update.
+
+        Wait for a result every few calls: XLA starts at most 32 launches of CPU devices at once,
+        and a launch waits for ever for a device whose own is not started.
+
+        Args:
+          iterations: decisions of every env per call.
+        """
+        iteration = self._each_seed(self.iteration, in_axes=(0, None))
+
+        def step(state: TrainState, _: None) -> tuple[TrainState, Means]:
+            # The same for all seeds: asked here, the branch not taken costs nothing.
+            observing = state.env_steps.max() < self.spec.config.whiten_steps
+            return iteration(state, observing)
+
+        def program(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+            state, metrics = jax.lax.scan(step, state, length=iterations)
+            totals = jax.tree.map(lambda x: x.sum(axis=0), metrics)
+            return state, {name: mean.value() for name, mean in totals.items()}
+
+        specs = self.state_specs
+        return jax.jit(
+            on_each_device(program, self.mesh, (specs,), (specs, REPLICATED)), donate_argnums=0
+        )
+
+    def export_params(self, state: TrainState) -> Params:
+        """Parameters of one run (no seed axis) for a network that takes raw observations."""
+        return jax.jit(self.fold)(state.params, state.statistics)
+
+    def _each_seed(self, function: Callable[..., Any], in_axes: Any = 0) -> Callable[..., Any]:
+        return jax.vmap(function, in_axes) if self.spec.num_seeds > 1 else function
+
+    # The rest is about one run and runs on each device.
+
+    def initial_state(self, key: PRNGKeyArray, sweep: dict[str, jax.Array]) -> TrainState:
+        """The state of a new run."""
+        spec, config = self.spec, self.spec.config
+        key, key_params, key_env = jax.random.split(key, 3)
+        local_envs = spec.per_device(spec.num_envs)
+        reset = spec.first_reset or self.env.reset
+        env_state = reset_all(reset, device_key(key_env), local_envs)
+        obs = as_array(env_state.obs)[0]
+        params = self.network.init(key_params, obs)
+        statistics = normalization.init(len(obs), config.whiten_floor)
+        scalar = jnp.float32(0.0)
+        example = Transition(obs, jnp.int32(0), scalar, scalar, obs)
+        return TrainState(
+            params=params,
+            target_params=jax.tree.map(jnp.copy, self.fold(params, statistics)),
+            opt_state=make_optimizer(config, spec.total_updates).init(params),
+            statistics=statistics,
+            env_state=env_state,
+            replay=replay.init(example, spec.per_device(config.replay_capacity), local_envs),
+            env_steps=jnp.int32(0),
+            gradient_steps=jnp.int32(0),
+            key=key,
+            sweep=sweep,
+        )
+
+    def iteration(self, state: TrainState, observing: Bool[Array, ""]) -> tuple[TrainState, Means]:
+        """One decision of every env, then the updates.
+
+        Args:
+          state: of one run, this device's part.
+          observing: whether observations still add to the statistics.
+        """
+        key, key_act, key_reset, key_update = jax.random.split(state.key, 4)
+        swept: Any = state.sweep
+        config = dataclasses.replace(self.spec.config, **swept)  # swept fields hold arrays
+        obs = as_array(state.env_state.obs)
+        statistics = jax.lax.cond(
+            observing,
+            lambda: normalization.observe(state.statistics, obs, config.whiten_floor),
+            lambda: state.statistics,
+        )
+        epsilon = linear_epsilon(config, state.env_steps)
+        with jax.named_scope("acting"):
+            params = self.fold(state.params, statistics)
+            keys = jax.random.split(device_key(key_act), len(obs))
+            action = jax.vmap(self.act, (None, 0, 0, None))(params, obs, keys, epsilon)
+        with jax.named_scope("env"):
+            stepped = step(self.env, state.env_state, action, device_key(key_reset))
+        with jax.named_scope("replay"):
+            buffer = replay.add(state.replay, stepped.transition, stepped.valid)
+        with jax.named_scope("updates"):
+            before = UpdateState(*(getattr(state, name) for name in UpdateState._fields))
+            after, update_metrics = self.learn(
+                before, buffer, statistics, config, device_key(key_update)
+            )
+        state = state._replace(
+            **after._asdict(),
+            statistics=statistics,
+            env_state=stepped.env_state,
+            replay=buffer,
+            env_steps=state.env_steps + self.spec.num_envs,
+            key=key,
+        )
+        return state, stepped.metrics | update_metrics | {"epsilon": Mean(epsilon, jnp.ones(()))}
+
+    def act(
+        self, params: Params, obs: Float[Array, " obs"], key: PRNGKeyArray, epsilon: jax.Array
+    ) -> Int[Array, ""]:
+        """The action of one env: epsilon-greedy, then exploration noise."""
+        factors = self.spec.action_factors or (self.env.action_size,)
+        levels = self.spec.config.exploration_noise
+        greedy = self.head(params, obs).argmax()
+        key, key_noise = jax.random.split(key)
+        action = epsilon_greedy(key, greedy, epsilon, math.prod(factors))
+        return exploration_noise(key_noise, action, factors, levels) if levels else action
+
+    def learn(
+        self,
+        state: UpdateState,
+        buffer: ReplayState,
+        statistics: RunningStatistics,
+        config: DQNConfig,
+        key: PRNGKeyArray,
+    ) -> tuple[UpdateState, Means]:
+        """The updates of one iteration, once the replay holds `min_replay_size`.
+
+        Returns:
+          The state; `loss`, a mean over the updates made, and `skipped_updates`, the share of
+          updates whose loss or gradient was not finite.
+        """
+        count = self.spec.updates_per_iteration
+        capacity = buffer.data.action.shape[0]
+        ready = buffer.size >= min(self.spec.per_device(config.min_replay_size), capacity)
+        keys = jax.random.split(key, count)
+        none = Mean(jnp.float32(0.0), jnp.float32(0.0))
+
+        def sample_and_update(state: UpdateState, key: jax.Array) -> tuple[UpdateState, Mean]:
+            return self.update(state, self.sample(buffer, key), statistics, config)
+
+        def all_updates(state: UpdateState) -> tuple[UpdateState, Mean]:
+            state, losses = jax.lax.scan(sample_and_update, state, keys)
+            return state, jax.tree.map(jnp.sum, losses)
+
+        state, loss = jax.lax.cond(ready, all_updates, lambda state: (state, none), state)
+        skipped = Mean(ready * (count - loss.number), jnp.float32(count))
+        return state, {"loss": loss, "skipped_updates": skipped}
+
+    def sample(self, buffer: ReplayState, key: PRNGKeyArray) -> Transition:
+        """This device's share of a batch, reflected with `mirror`."""
+        config = self.spec.config
+        key, key_mirror = jax.random.split(key)
+        with jax.named_scope("replay"):
+            batch = replay.sample(buffer, key, self.spec.per_device(config.batch_size))
+        if config.mirror and self.spec.symmetries is not None:
+            return replay.reflect(batch, self.spec.symmetries, key_mirror)
+        return batch
+
+    def update(
+        self,
+        state: UpdateState,
+        batch: Transition,
+        statistics: RunningStatistics,
+        config: DQNConfig,
+    ) -> tuple[UpdateState, Mean]:
+        """One gradient step on a batch of which each device has its share.
+
+        Args:
+          state: the same on every device, before and after.
+          batch: (share, ...) per field.
+          statistics: of the observations so far.
+          config: the algorithm.
+
+        Returns:
+          The state, unchanged if loss or gradient are not finite; the loss over all devices, a
+          mean with count 1, or 0 if the step was skipped.
+        """
+
+        def loss_of(params: Params) -> jax.Array:
+            return self.loss(self.fold(params, statistics), state.target_params, batch, config)
+
+        loss: jax.Array
+        loss, grads = mean_over_devices(jax.value_and_grad(loss_of)(state.params))
+        # The cosine runs over the updates of a whole run; none is made before the warm-up.
+        optimizer = make_optimizer(config, self.spec.total_updates)
+        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, updates)
+        gradient_steps = state.gradient_steps + 1
+        target_params = jax.lax.cond(
+            gradient_steps % config.target_update_period == 0,
+            lambda: self.fold(params, statistics),
+            lambda: state.target_params,
+        )
+        new = UpdateState(params, target_params, opt_state, gradient_steps)
+        finite = jnp.isfinite(loss) & jnp.isfinite(optax.global_norm(grads))
+        state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new, state)
+        return state, Mean(jnp.where(finite, loss, 0.0), finite.astype(jnp.float32))
+
+    def loss(
+        self, params: Params, target_params: Params, batch: Transition, config: DQNConfig
+    ) -> Float[Array, ""]:
+        """Mean squared TD error of a batch; beyond `huber_delta`, the square's tangent there.
+
+        With `double`, the online network selects the action that the target network values.
+        """
+
+        def error(t: Transition) -> jax.Array:
+            q_tm1, q_t = self.head(params, t.obs), self.head(target_params, t.next_obs)
+            q_t_selector = self.head(params, t.next_obs) if config.double else q_t
+            discount_t = config.gamma * (1 - t.terminated)
+            return td_error(q_tm1, t.action, t.reward, discount_t, q_t, q_t_selector)
+
+        errors = jax.vmap(error)(batch)
+        if config.huber_delta is None:
+            return jnp.mean(errors**2)
+        return 2 * jnp.mean(optax.losses.huber_loss(errors, delta=config.huber_delta))
+
+    def head(self, params: Params, obs: Float[Array, "*batch obs"]) -> Head:
+        """The network's action values of raw observations."""
+        head = self.network.apply(params, obs, method="head")
+        assert isinstance(head, Head)
+        return head
+
+    def fold(self, params: Params, statistics: RunningStatistics) -> Params:
+        """Folds the whitening into the parameters: one small kernel instead of every input."""
+        if not self.spec.config.whiten_steps:
+            return params
+        return self.network.fold_whitening(params, statistics.mean, statistics.matrix)
+
+
+def td_error(
+    q_tm1: Head,
+    a_tm1: Int[Array, ""],
+    r_t: Float[Array, ""],
+    discount_t: Float[Array, ""],
+    q_t: Head,
+    q_t_selector: Head,
+) -> Float[Array, ""]:
+    """TD error of one transition, r_t + discount_t * q_t[argmax q_t_selector] - q_tm1[a_tm1].
+
+    Q-learning if `q_t_selector` is `q_t` (paper Eq. 1); else Double Q-learning (van Hasselt et
+    al. 2015, https://arxiv.org/abs/1509.06461, Eq. 4).
+
+    Args:
+      q_tm1: action values of the online network at t - 1.
+      a_tm1: action index at t - 1.
+      r_t: reward at t.
+      discount_t: gamma, or 0 after a termination.
+      q_t: action values of the target network at t.
+      q_t_selector: action values that select the action at t.
+    """
+    return r_t + discount_t * q_t.q_value(q_t_selector.argmax()) - q_tm1.q_value(a_tm1)
+
+
+def make_optimizer(config: DQNConfig, gradient_steps: int) -> optax.GradientTransformation:
+    """Adam with clipped gradients and a cosine from learning_rate to its end share."""
+    schedule = optax.cosine_decay_schedule(
+        config.learning_rate, max(gradient_steps, 1), config.learning_rate_end_share
+    )
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
+
+
+def linear_epsilon(config: DQNConfig, env_steps: Int[Array, ""]) -> Float[Array, ""]:
+    """Share of random actions: linear from epsilon_start to epsilon_end, then flat.
+
+    epsilon = start + (end - start) * min(env_steps / epsilon_decay_steps, 1)
+    """
+    # optax.linear_schedule branches on its number of steps, which is an array in a sweep.
+    share = jnp.minimum(env_steps / config.epsilon_decay_steps, 1.0)
+    return config.epsilon_start + (config.epsilon_end - config.epsilon_start) * share
+
+
+def epsilon_greedy(
+    key: PRNGKeyArray, greedy: jax.Array, epsilon: jax.Array, num_actions: int
+) -> Int[Array, ""]:
+    """The action index `greedy`, or with probability `epsilon` a uniformly random one."""
+    key_which, key_random = jax.random.split(key)
+    random = jax.random.randint(key_random, (), 0, num_actions)
+    return jnp.where(jax.random.bernoulli(key_which, epsilon), random, greedy.astype(random.dtype))
+
+
+def exploration_noise(
+    key: PRNGKeyArray, action: jax.Array, factors: Sequence[int], levels: int
+) -> Int[Array, ""]:
+    """Moves an action by up to `levels` on each factor of its index, uniformly.
+
+    A greedy action alone shows a reward near its peak, which tells how far off it was but
+    not to which side; its neighbours tell that.
+
+    Args:
+      key: PRNG key.
+      action: index, a mixed-radix number.
+      factors: sizes of its digits.
+      levels: greatest move; digits stop at their ends.
+    """
+    move = jax.random.randint(key, (len(factors),), -levels, levels + 1)
+    digits = jnp.stack(jnp.unravel_index(action, tuple(factors))) + move
+    digits = jnp.clip(digits, 0, jnp.asarray(factors) - 1)
+    return jnp.ravel_multi_index(tuple(digits), tuple(factors), mode="clip").astype(action.dtype)
+
+
+class Step(NamedTuple):
+    """One step of this device's envs."""
+
+    env_state: State
+    """(envs, ...) per leaf, done envs reset."""
+    transition: Transition
+    """(envs, ...) per field, before any reset; a diverged env's row repeats another env's."""
+    valid: Bool[Array, ""]
+    """Whether every device has an env that did not diverge."""
+    metrics: Means
+    """Over all devices: the env's own, `reward`, and `diverged`, the share of diverged envs."""
+
+
+def step(env: Env, state: State, action: Int[Array, " envs"], key: PRNGKeyArray) -> Step:
+    """Steps this device's envs once and resets those that are done.
+
+    An env whose transition is not finite has diverged: it is done, and not stored.
+
+    Args:
+      env: unbatched.
+      state: (envs, ...) per leaf.
+      action: indices.
+      key: for the resets.
+    """
+    after = jax.vmap(env.step)(state, action)
+    truncation = after.info.get("truncation", jnp.zeros_like(after.done))
+    transition = Transition(
+        obs=as_array(state.obs),
+        action=action,
+        reward=after.reward,
+        terminated=after.done * (1 - truncation),
+        next_obs=as_array(after.obs),
+    )
+    finite = jax.vmap(all_finite)(transition)
+    after = after.replace(done=jnp.where(finite, after.done, 1.0))  # pyright: ignore
+    row = jnp.where(finite, jnp.arange(len(finite)), jnp.argmax(finite))
+    valid = jax.lax.pmin(finite.any().astype(jnp.int32), AXIS) > 0
+    own = dict(after.metrics)
+    diverged = jnp.where(finite, own.pop("diverged", jnp.zeros_like(after.done)), 1.0)
+    means = {k: mean_where(x, finite) for k, x in (own | {"reward": after.reward}).items()}
+    means["diverged"] = mean_where(diverged, jnp.ones_like(finite))
+    after = reset_done(env.reset, after, key)
+    return Step(after, jax.tree.map(lambda x: x[row], transition), valid, means)
+
+
+def reset_all(reset: Reset, key: PRNGKeyArray, count: int) -> State:
+    """`count` fresh envs, (count, ...) per leaf."""
+    return jax.vmap(reset)(jax.random.split(key, count))
+
+
+def reset_done(reset: Reset, state: State, key: PRNGKeyArray) -> State:
+    """Replaces the done envs of a batch by fresh ones."""
+    new = reset_all(reset, key, state.reward.shape[0])
+    done = state.done.astype(bool)
+
+    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(choose, new, state)
+
+
+def as_array(obs: object) -> jax.Array:
+    """The observation of an env; brax allows dictionaries, this DQN takes arrays.
+
+    Raises:
+      TypeError: for anything else.
+    """
+    if not isinstance(obs, jax.Array):
+        raise TypeError(f"the env observes {type(obs).__name__}; this DQN takes arrays")
+    return obs

@@ -1,0 +1,71 @@
+"""Running statistics of the observations, and the whitening that follows from them.
+
+Neighbouring sensor samples are nearly equal, and their difference tells a tilt from a sway.
+Without whitening, directions of small variance take orders of magnitude longer to learn
+(LeCun et al. 1998, "Efficient BackProp", section 4.3).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mjx_balance.dqn.mesh import AXIS, all_finite
+
+RECENCY = 4.0
+"""Batch k weighs about k^(RECENCY - 1): the last quarter of the batches weighs most, the first
+random actions hardly at all."""
+
+
+class RunningStatistics(NamedTuple):
+    """Weighted moments of the observations, and their whitening matrix."""
+
+    mean: Float[Array, " obs"]
+    covariance: Float[Array, "obs obs"]
+    batches: Float[Array, ""]
+    """Batches so far."""
+    matrix: Float[Array, "obs obs"]
+    """Whitens: (obs - mean) @ matrix."""
+
+
+def init(obs_size: int, floor: float) -> RunningStatistics:
+    """Statistics of white observations; see `whitening_matrix` for `floor`."""
+    covariance = jnp.eye(obs_size)
+    matrix = whitening_matrix(covariance, floor)
+    return RunningStatistics(jnp.zeros(obs_size), covariance, jnp.float32(0.0), matrix)
+
+
+def observe(
+    statistics: RunningStatistics, obs: Float[Array, "envs obs"], floor: float
+) -> RunningStatistics:
+    """Adds the finite observations of all devices as one batch; runs on each device."""
+    mask = jax.vmap(all_finite)(obs)[:, None]
+    count = jax.lax.psum(mask.sum(), AXIS)
+    mean: jax.Array = jax.lax.psum(jnp.where(mask, obs, 0.0).sum(axis=0), AXIS) / count
+    centered = jnp.where(mask, obs - mean, 0.0)
+    # Whitening divides by small differences between neighbouring samples.
+    with jax.default_matmul_precision("highest"):
+        within = jax.lax.psum(centered.T @ centered, AXIS) / count
+        weight = RECENCY / (statistics.batches + RECENCY)
+        step = mean - statistics.mean
+        between = (1 - weight) * weight * jnp.outer(step, step)
+        covariance = (1 - weight) * statistics.covariance + weight * within + between
+        new = RunningStatistics(
+            statistics.mean + weight * step,
+            covariance,
+            statistics.batches + 1,
+            whitening_matrix(covariance, floor),
+        )
+    usable = all_finite(new)  # not without observations, nor if their squares overflow
+    return jax.tree.map(lambda new, old: jnp.where(usable, new, old), new, statistics)
+
+
+def whitening_matrix(covariance: Float[Array, "obs obs"], floor: float) -> Float[Array, "obs obs"]:
+    """The symmetric whitening matrix (covariance + floor)^(-1/2).
+
+    Of all whitening matrices it changes the inputs least, and it changes smoothly with
+    the covariance (Kessy et al. 2018, https://arxiv.org/abs/1512.00809, section 3.1).
+    """
+    values, vectors = jnp.linalg.eigh(covariance)
+    return (vectors / jnp.sqrt(jnp.maximum(values, 0.0) + floor)) @ vectors.T

@@ -1,0 +1,17 @@
+"""How an env's metrics are logged: a row per metric, so that a training loop knows no task."""
+
+from typing import Literal, NamedTuple
+
+
+class Metric(NamedTuple):
+    """A row of an env's table `metrics`: its name in `State.metrics` -> how its mean is logged.
+
+    A metric without a row is logged under its own name, as a mean over decisions.
+    """
+
+    name: str | None = None
+    """Logged name; None: its own."""
+    per: Literal["decision", "minute", "call"] = "decision"
+    """A mean over decisions, a rate per minute of one env, or a sum over a call's decisions."""
+    per_seed: bool = False
+    """Whether it is also logged for every seed, if there are several."""

@@ -1,0 +1,121 @@
+"""One update by hand: TD error, loss, optimiser."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from mjx_balance.config import DQNConfig
+from mjx_balance.dqn import DQN, DQNSpec
+from mjx_balance.dqn.dqn import make_optimizer, td_error
+from mjx_balance.dqn.replay import Transition
+from mjx_balance.policy.heads import Added
+
+CONFIG = DQNConfig(learning_rate=0.1, learning_rate_end_share=0.1, max_grad_norm=2.0)
+Q_TM1, Q_T, SELECTOR = ([1.0, 2.0, 3.0], [4.0, -1.0, 2.0], [0.0, 9.0, 1.0])
+ERRORS = [
+    (False, 0.0, 0.5 + 0.1 * 4 - 2),
+    (True, 0.0, 0.5 + 0.1 * -1 - 2),
+    (False, 1.0, 0.5 - 2),
+]
+"""Double DQN, terminated -> TD error of action 1, reward 0.5, gamma 0.1."""
+
+
+class Table:
+    """A network whose parameters are the action values of every state, an integer."""
+
+    def apply(self, params: jax.Array, obs: jax.Array, method: str) -> Added:
+        assert method == "head"
+        values = params[obs[..., 0].astype(int)]
+        return Added(values, (values.shape[-1],))
+
+
+def table_loss(params: Any, target: Any, batch: Transition, config: DQNConfig) -> jax.Array:
+    stub: Any = Table()
+    return DQN(stub, stub, DQNSpec(config, 2, 2)).loss(params, target, batch, config)
+
+
+@pytest.mark.parametrize(("double", "terminated", "error"), ERRORS)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_td_error_by_hand(double: bool, terminated: float, error: float, compiled: bool) -> None:
+    def one(*values: Any) -> jax.Array:
+        q_tm1, a_tm1, r_t, discount_t, *others = map(jnp.asarray, values)
+        q_t, selector = (Added(x, (3,)) for x in others)
+        return td_error(Added(q_tm1, (3,)), a_tm1, r_t, discount_t, q_t, selector)
+
+    function = jax.jit(one) if compiled else one
+    discount_t = 0.1 * (1 - terminated)
+    got = function(Q_TM1, 1, 0.5, discount_t, Q_T, SELECTOR if double else Q_T)
+    assert float(got) == pytest.approx(error)
+
+
+@pytest.mark.parametrize(("double", "terminated", "error"), ERRORS)
+def test_loss_and_gradient_by_hand(double: bool, terminated: float, error: float) -> None:
+    """The gradient reaches the value of the action taken and nothing else."""
+    params, target = jnp.asarray([Q_TM1, SELECTOR]), jnp.asarray([[9.0, 9.0, 9.0], Q_T])
+    batch = Transition(*map(jnp.asarray, ([[0.0]], [1], [0.5], [terminated], [[1.0]])))
+    config = DQNConfig(gamma=0.1, double=double)
+    value, slopes = jax.value_and_grad(table_loss, (0, 1))(params, target, batch, config)
+    assert float(value) == pytest.approx(error**2)
+    np.testing.assert_allclose(slopes[0], [[0, -2 * error, 0], [0, 0, 0]], rtol=1e-5)
+    expected = np.zeros((2, 3))
+    expected[1, 1 if double else 0] = 2 * error * 0.1 * (1 - terminated)
+    np.testing.assert_allclose(slopes[1], expected, atol=1e-6)
+
+
+def test_loss_is_linear_in_errors_beyond_delta() -> None:
+    """Errors 0.3, 2 and -5: below delta squared; beyond, the tangent 2 delta |e| - delta^2."""
+    zeros = jnp.zeros(3)
+    rewards = jnp.asarray([0.3, 2, -5])
+    batch = Transition(zeros[:, None], zeros.astype(int), rewards, zeros, zeros[:, None])
+    config = DQNConfig(gamma=0, huber_delta=0.5)
+    q = jnp.zeros((1, 1))
+    value, slope = jax.value_and_grad(table_loss)(q, q, batch, config)
+    assert float(value) == pytest.approx((0.09 + 1.75 + 4.75) / 3)
+    assert slope.item() == pytest.approx((-2 * 0.3 - 2 * 0.5 + 2 * 0.5) / 3)
+
+
+def test_loss_is_the_mean_over_the_batch() -> None:
+    rng = np.random.default_rng(0)
+    q_tm1, q_t = rng.normal(size=(2, 5, 3))
+    action, reward = np.asarray([0, 1, 2, 1, 0]), np.arange(5.0)
+    terminated, states = np.asarray([0.0, 1, 0, 0, 1]), np.arange(5.0)[:, None]
+    batch = Transition(*map(jnp.asarray, (states, action, reward, terminated, states)))
+    got = table_loss(jnp.asarray(q_tm1), jnp.asarray(q_t), batch, DQNConfig(gamma=0.3))
+    errors = reward + 0.3 * (1 - terminated) * q_t.max(axis=-1) - q_tm1[np.arange(5), action]
+    assert float(got) == pytest.approx(np.mean(errors**2), rel=1e-5)
+
+
+def steps(config: DQNConfig, total: int, count: int) -> list[float]:
+    """Adam's steps for a gradient that never changes: minus the learning rate."""
+    optimizer = make_optimizer(config, total)
+    state, found = optimizer.init(jnp.zeros(())), []
+    for _ in range(count):
+        update, state = optimizer.update(jnp.ones(()), state)
+        found.append(float(np.asarray(update)))
+    return found
+
+
+def test_learning_rate_is_a_cosine_from_its_start_to_its_end() -> None:
+    found = steps(CONFIG, 10, 13)
+    assert [found[k] for k in (0, 5, 10, 12)] == pytest.approx(
+        [-0.1, -0.055, -0.01, -0.01], rel=1e-4
+    )
+    constant = dataclasses.replace(CONFIG, learning_rate_end_share=1.0)
+    assert steps(constant, 4, 6) == pytest.approx([-0.1] * 6, rel=1e-4)
+    assert math.isfinite(steps(CONFIG, 0, 1)[0]), "a run without updates"
+
+
+@pytest.mark.parametrize(("size", "scale"), [(1.0, 2 / 10), (0.1, 1.0)])
+def test_gradients_are_clipped_by_their_norm_over_all_arrays(size: float, scale: float) -> None:
+    """(6, 8) and 0 have norm 10: all are scaled by 2 / 10 before Adam squares them."""
+    optimizer = make_optimizer(CONFIG, 10)
+    grads = {"a": size * jnp.asarray([6.0, 8.0]), "b": jnp.zeros(1)}
+    _, state = optimizer.update(grads, optimizer.init(jax.tree.map(jnp.zeros_like, grads)))
+    first_moment = optax.tree_utils.tree_get(state, "mu")["a"]
+    np.testing.assert_allclose(first_moment, 0.1 * scale * np.asarray(grads["a"]), rtol=1e-5)
