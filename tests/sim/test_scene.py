@@ -229,7 +229,7 @@ def test_stance_goes_on_as_if_nothing_had_begun(scene: Scene) -> None:
 
 @pytest.mark.parametrize("height", [0.25, 0.38])
 def test_robot_stands_at_the_height_it_is_told(config: Config, height: float) -> None:
-    scene = load_scene(with_task(config, body_height=height))
+    scene = load_scene(with_task(config, body_height=height, max_incline=5.0))
     root = scene.model.joint(f"{ROBOT}root").qposadr[0]
     assert scene.stance.qpos[root + 2] == pytest.approx(height, abs=2e-3)
     assert scene.model.body(f"{ROBOT}trunk").pos[2] == pytest.approx(height)
