@@ -331,7 +331,12 @@ class _Inputs:
     """
 
     def __init__(self, rows: list[dict[str, Any]], legs: int) -> None:
-        channels = {"height": legs, "command": legs, "gyro": 3, "accelerometer": 3}
+        channels = {
+            "height": legs,
+            "command": legs,
+            "gyro": 3,
+            "accelerometer": 3,
+        }
         self._ages = dict.fromkeys(channels, 1)
         groups: dict[tuple[str, int], list[tuple[int, int, int]]] = {}
         for k, row in enumerate(rows):
