@@ -210,9 +210,9 @@ def measure(budget: float, sizes: list[int], engines: list[str]) -> dict[str, An
     with tempfile.TemporaryDirectory() as work:
         if trainings:
             fastest = max(trainings, key=lambda row: row[RATE])
-            where = fastest["engine"], fastest["envs"]
             for start in ("cold", "warm"):
-                runs += parts.rows(whole_run, *where, start, Path(work))
+                where = fastest["envs"], start, Path(work)
+                runs += parts.rows(whole_run, fastest["engine"], *where)
     return {
         "versions": {x: installed_version(x) for x in PACKAGES},
         "rows": rows + trainings,

@@ -15,10 +15,8 @@ from typing import Any
 
 REPO = Path(__file__).resolve().parent.parent
 POLICY = REPO / "policies" / "best.safetensors"
-DURATION = 60.0
-"""Of an evaluated scenario, s."""
+DURATION = 60.0  # of an evaluated scenario, s
 TILTS = "mean / p95 / max tilt in deg over every physics step"
-"""Said below tables of evaluations."""
 
 Row = dict[str, Any]
 """One row of a table: title of a column -> value."""

@@ -28,9 +28,7 @@ from mjx_balance.evaluation.controllers import Controller
 from mjx_balance.evaluation.suites import HEADLINE
 from mjx_balance.sim.scene import Scene, load_scene
 
-HIDDEN = (256, 256)
-EXPLORE = 20_000
-"""Decisions of sb3 in which epsilon falls to its end, however long the run may be."""
+EXPLORE = 20_000  # decisions of sb3 in which epsilon falls to its end, however long the run
 
 
 def checkpoint(scenarios: int, decisions: int, scene: Scene, controller: Controller) -> None:
@@ -77,7 +75,7 @@ def train_sb3(report: Callable[..., None], decisions: int, every: int) -> None:
         target_update_interval=1_000,
         exploration_fraction=min(1.0, EXPLORE / decisions),
         exploration_final_eps=0.05,
-        policy_kwargs={"net_arch": list(HIDDEN)},
+        policy_kwargs={"net_arch": [256, 256]},
         seed=0,
         device="cpu",
     )
@@ -130,8 +128,7 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, default=64, help="of each evaluation")
     args = parser.parse_args()
     with contextlib.redirect_stdout(sys.stderr):
-        report = functools.partial(checkpoint, args.scenarios)
-        PEERS[args.peer](report, args.decisions, args.every)
+        PEERS[args.peer](functools.partial(checkpoint, args.scenarios), args.decisions, args.every)
 
 
 if __name__ == "__main__":

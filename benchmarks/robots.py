@@ -28,8 +28,7 @@ from mjx_balance.robots.catalogue import shipped
 SUITES = {"paper": 1, "corner": 1, "push": 4}
 """Suite -> what `--scenarios` is divided by."""
 PEERS = ("pd-imu", "rate-oracle")
-TIMES = "times.json"
-"""Beside the policies: how long each robot's `train.py` took, s."""
+TIMES = "times.json"  # beside the policies: seconds that each robot's `train.py` took
 
 
 def trained(robot: str, args: argparse.Namespace) -> Path:

@@ -167,8 +167,7 @@ def main() -> int:
         return complain(f"--every is {args.every}; it must be 1 to --most, {args.most}")
     if args.json and not args.json.absolute().parent.is_dir():
         return complain(f"cannot write {args.json}: its folder does not exist")
-    rows: list[Row] = []
-    code = 0
+    rows, code = [], 0
     with tempfile.TemporaryDirectory() as work:
         try:
             for name in dict.fromkeys(args.contenders):
