@@ -245,7 +245,7 @@ def with_products_of(bits: int) -> Any:
 def trained_policy(products: str, num_envs: int, seed: int, decisions: int | None) -> Policy:
     """Preset `default`, trained over MuJoCo's C engine."""
     config = dataclasses.replace(preset("default"), engine="mujoco")
-    config = sizing.size_to_device(sizing.widened(config, num_envs))
+    config = sizing.size_to_device(sizing.scale_sizes(config, num_envs))
     env = BalanceEnv(config)
     learner = sizing.make_learner(config, env)
     with with_products_of(MANTISSA[products]):

@@ -45,6 +45,7 @@ with quiet_imports("torch"):
     from mjx_balance.envs.balance import BalanceEnv
     from mjx_balance.training import processes as run_processes
     from mjx_balance.training import program_cache, sizing
+    from mjx_balance.training.cluster import Cluster
 from mjx_balance.sim.scene import Scene, load_scene
 
 DECISIONS_PER_CALL = 2_048
@@ -238,9 +239,9 @@ def seeds(args: argparse.Namespace) -> None:
     common.report(args, "throughput seeds", rows, note, forms)
 
 
-def process_row(place: Any, engine: str, num_envs: int, batches: int, rounds: int) -> Row:
+def process_row(cluster: Any, engine: str, num_envs: int, batches: int, rounds: int) -> Row:
     """One process of several, on a core of its own: training and exchanges of gradients."""
-    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[place.index]})
+    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[cluster.process_id]})
     default = preset("default").dqn
     dqn = dataclasses.replace(default, batch_size=batches * default.batch_size)
     iterations = max(1, DECISIONS_PER_CALL // num_envs)
@@ -249,7 +250,7 @@ def process_row(place: Any, engine: str, num_envs: int, batches: int, rounds: in
         step = lambda x, _: (mean_over_devices(x + 1), None)  # noqa: E731
         return jax.lax.scan(step, x, length=EXCHANGES)[0]
 
-    with run_processes.joined(place, ()) as us:
+    with run_processes.joined(cluster, ()) as us:
         config, learner = make_learner(engine=engine, num_envs=num_envs, dqn=dqn)
         gradients = jnp.zeros(len(ravel_pytree(learner.init(0).params)[0]) + 1)  # and the loss
         specs = {"in_specs": REPLICATED, "out_specs": REPLICATED}
@@ -272,10 +273,10 @@ def run_of_processes(count: int, *args: Any) -> Row:
     """What the first of so many processes measures; `args` are those of `process_row`."""
     with socket.create_server(("", 0)) as server:
         address = f"localhost:{server.getsockname()[1]}"
-    places = [run_processes.Place(address, index, count) for index in range(count)]
+    clusters = [Cluster(address, count, index) for index in range(count)]
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(count, spawn) as pool:
-        runs = [pool.submit(process_row, place, *args) for place in places]
+        runs = [pool.submit(process_row, cluster, *args) for cluster in clusters]
         return runs[0].result()
 
 

@@ -41,7 +41,7 @@ from mjx_balance.report import page as report_page
 from mjx_balance.robots.catalogue import find_robot, shipped
 from mjx_balance.robots.schema import LegFile, RobotFile, parse_robot_file
 from mjx_balance.sim.engines.compiled import mujoco_engine
-from mjx_balance.training import processes, run
+from mjx_balance.training import cluster, run
 
 REPO = Path(__file__).resolve().parent.parent
 DOCS = REPO / "docs"
@@ -293,7 +293,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         return None, None, {}
 
     trainer = inspect.signature(ppo.train)
-    place = types.SimpleNamespace(index=0)
+    first = types.SimpleNamespace(process_id=0)
     monkeypatch.setattr(evaluate_command, "run_suite", few)
     monkeypatch.setattr(evaluation, "policy_scene", found)
     monkeypatch.setattr(render, "write", drawn)
@@ -303,7 +303,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ppo, "train", train_ppo)
     monkeypatch.setattr(train_command, "read_run_config", lambda path: config.preset("default"))
     monkeypatch.setattr(evaluate_command, "_video", filmed)
-    monkeypatch.setattr(processes, "find_place", lambda *where: place)
+    monkeypatch.setattr(cluster, "find_cluster", lambda *where: first)
     monkeypatch.setattr(report_page, "write_report", lambda *arguments: [])
     # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
     monkeypatch.setattr(env, "make_engine", mujoco_engine)

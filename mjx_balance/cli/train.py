@@ -94,18 +94,19 @@ def _train(args: TrainArgs) -> int:
     from jax.errors import JaxRuntimeError
 
     from mjx_balance.report.progress import Display
-    from mjx_balance.training import processes, run, sizing
+    from mjx_balance.training import run, sizing
+    from mjx_balance.training.cluster import find_cluster
 
     display = Display()
     try:
-        place = None
+        cluster = None
         where = (args.coordinator, args.process_id, args.num_processes)
         if args.distributed or where != (None, None, None):
-            place = processes.find_place(*where)
-            if place.index:
+            cluster = find_cluster(*where)
+            if cluster.process_id:
                 display = Display(Console(quiet=True))
-        run.train(args.config, args.run_dir, args.resume, display, place, args.profile)
-    except (processes.ProcessLostError, PolicyError) as error:
+        run.train(args.config, args.run_dir, args.resume, display, cluster, args.profile)
+    except PolicyError as error:
         return complain(str(error), FAILED)
     except JaxRuntimeError as error:
         explanation = sizing.explained(error)

@@ -15,7 +15,7 @@ import orbax.checkpoint as ocp
 
 from mjx_balance.errors import InputError
 from mjx_balance.files.text import MESSAGE, shorten
-from mjx_balance.training.processes import ALONE, Processes, ProcessLostError
+from mjx_balance.training.processes import ALONE, Processes
 
 T = TypeVar("T")
 
@@ -58,27 +58,25 @@ def save(directory: Path, env_steps: int, state: object, processes: Processes = 
             shutil.rmtree(directory / str(stale))
 
     try:
-        if not processes.from_first(begin):
+        if not processes.broadcast(begin, OSError):
             return
         with _checkpointer() as checkpointer:
             checkpointer.save((part / "state").resolve(), state)
-        processes.from_first(end)
-    except ProcessLostError:
-        raise
+        processes.broadcast(end, OSError)
     except Exception as error:  # whatever orbax raises on a full disk, say
         reason = shorten(error, MESSAGE)
         raise CheckpointError(f"the checkpoint {path} cannot be written: {reason}") from error
 
 
 def restore(
-    directory: Path, like: T, say: Callable[[str], None], processes: Processes = ALONE
+    directory: Path, like: T, log_fn: Callable[[str], None], processes: Processes = ALONE
 ) -> T | None:
     """Reads the newest checkpoint that is whole.
 
     Args:
       directory: of all checkpoints of a run.
       like: a state with the structure, shapes, dtypes and shardings wanted.
-      say: told of every damaged one; once a whole one is found, they are removed, as the
+      log_fn: told of every damaged one; once a whole one is found, they are removed, as the
         run will come by there again.
       processes: that share the state, as many as they now are.
 
@@ -88,16 +86,16 @@ def restore(
     Raises:
       CheckpointError: if there are checkpoints, but none is whole.
     """
-    steps = processes.from_first(lambda: saved_steps(directory))
+    steps = processes.broadcast(lambda: saved_steps(directory))
     for k, step in reversed(list(enumerate(steps))):
         path = directory / str(step)
-        whole = processes.from_first(lambda path=path: _is_whole(path))
+        whole = processes.broadcast(lambda path=path: _is_whole(path))
         state = _read(path, like) if whole else None
         if all(processes.gather(state is not None)):
             for damaged in steps[k + 1 :] if processes.first else ():
                 shutil.rmtree(directory / str(damaged))
             return state
-        say(f"the checkpoint {path} is damaged" + ("; trying the one before" if k else ""))
+        log_fn(f"the checkpoint {path} is damaged" + ("; trying the one before" if k else ""))
     if steps:
         raise CheckpointError(
             f"no checkpoint in {directory} is whole; start a new run with --run-dir"

@@ -16,7 +16,7 @@ from mjx_balance.files.run_folder import RunFolder, write_atomically, write_json
 from mjx_balance.policy.file import Policy, PolicyError, load_policy, save_policy
 from mjx_balance.report import tables
 from mjx_balance.report.progress import Display
-from mjx_balance.training.program_cache import Say
+from mjx_balance.training.program_cache import LogFn
 from mjx_balance.training.validation import Results, best_validated, exports, scalars, score
 
 CHOICE_SCENARIOS = 32
@@ -48,7 +48,7 @@ def export(
     folder: RunFolder,
     state: TrainState,
     seconds: float,
-    say: Say,
+    log_fn: LogFn,
 ) -> list[Policy]:
     """Writes a policy per seed; the first also as the run's, until a better one is known.
 
@@ -62,7 +62,7 @@ def export(
       folder: to write into.
       state: of all seeds.
       seconds: spent learning.
-      say: told of every seed whose weights are no policy; the others are not held up by it.
+      log_fn: told of every seed whose weights are no policy; the others are not held up by it.
 
     Raises:
       PolicyError: if no seed has a policy.
@@ -73,7 +73,7 @@ def export(
         manifest["training"]["seconds_learning_since_start_or_resume"] = round(seconds, 1)
         seed = manifest["config"]["seed"]
         file = folder.seed_policy(seed) if several else folder.policy
-        best = best_validated(folder, seed, say) if config.export == "best" else None
+        best = best_validated(folder, seed, log_fn) if config.export == "best" else None
         file.parent.mkdir(exist_ok=True)
         try:
             if best is None:
@@ -81,10 +81,10 @@ def export(
             else:
                 write_atomically(file, best.read_bytes())
                 policies.append(load_policy(file))
-                say(f"seed {seed}: of {best.parent.name} decisions, the best by validation")
+                log_fn(f"seed {seed}: of {best.parent.name} decisions, the best by validation")
             files.append(file)
         except PolicyError as error:
-            say(f"seed {seed} gives no policy: {error}")
+            log_fn(f"seed {seed} gives no policy: {error}")
     if not policies:
         raise PolicyError(
             f"the run in {folder.path} learnt no policy of finite numbers; lower learning_rate"

@@ -95,9 +95,9 @@ class Interrupts:
     KeyboardInterrupt, which loses what was learnt since the last checkpoint.
     """
 
-    def __init__(self, say: Callable[[str], None]):
-        """Answers with `say`; use as a context."""
-        self._say = say
+    def __init__(self, log_fn: Callable[[str], None]):
+        """Answers by `log_fn`; use as a context."""
+        self._log_fn = log_fn
         self._received = 0
         self._answered = False
 
@@ -148,7 +148,7 @@ class Interrupts:
     def _answer(self) -> None:
         if self._received and not self._answered:
             self._answered = True
-            self._say(
+            self._log_fn(
                 "stopping after this call and saving; interrupt again to quit at once, without "
                 "what was learnt since the last checkpoint"
             )
@@ -179,7 +179,17 @@ def learn(
     twice. What the folder has logged or validated after the state's decisions is dropped first.
 
     Of several processes all call the program and save; the first one logs, shows and validates.
-    They stop together, whichever of them is told to.
+    They stop together, whichever of them is interrupted.
+
+    Args:
+      plan: of the run.
+      program: compiled.
+      state: to go on from.
+      folder: to log and save into.
+      display: shows what is logged.
+      stop: whether the user interrupts.
+      validate: tries the greedy policies, when the plan says so.
+      processes: that share the state.
 
     Returns:
       The last state, and the seconds spent learning by this call, validations apart.
@@ -188,7 +198,7 @@ def learn(
     seconds = validating = 0.0
     saved_at = time.monotonic()
     with _journal(plan, folder, display, done) if processes.first else nullcontext() as write:
-        while done < plan.total and not processes.any(bool(stop)):
+        while done < plan.total and not stop.run(processes.any, bool(stop)):
             before, began = done, time.perf_counter()
             state, raw = stop.run(_finished, program, state)
             elapsed = time.perf_counter() - began
@@ -204,7 +214,7 @@ def learn(
                     metrics["perf/validation_share"] = validating / (seconds + validating)
                     seeds |= listed(held_out)
                 write(state, metrics, seeds)
-            if processes.any(time.monotonic() - saved_at >= plan.checkpoint_seconds):
+            if stop.run(processes.any, time.monotonic() - saved_at >= plan.checkpoint_seconds):
                 checkpoints.save(folder.checkpoints, done, state, processes)
                 saved_at = time.monotonic()
     checkpoints.save(folder.checkpoints, done, state, processes)

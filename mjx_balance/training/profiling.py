@@ -1,13 +1,19 @@
-"""Where a call of the training program spends its time, by the names of its parts."""
+"""Where a call of the training program spends its time, by the names of its parts.
+
+XLA's traces of a CPU name an operation without the scope that it comes from (jaxlib 0.9.2): their
+stats are `hlo_op`, `hlo_module` and numbers. The compiled program's text has both, for every
+platform.
+"""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 
-from mjx_balance.training.program_cache import CompiledProgram
+from mjx_balance.files.run_folder import write_json
+from mjx_balance.training.program_cache import CompiledProgram, LogFn
 
 MEANING = {
     "physics": "the engine's steps",
@@ -48,16 +54,16 @@ class Profiled:
         self,
         program: CompiledProgram,
         folder: Path,
-        done: Callable[[dict[str, float]], None],
+        log_fn: LogFn,
     ):
         """Calls `program`.
 
         Args:
           program: compiled without a cache, which would not keep the names of its parts.
-          folder: to write the trace into.
-          done: takes the shares of the time, in order, once they are known.
+          folder: to write the trace and its `shares.json` into.
+          log_fn: takes the shares of the time.
         """
-        self._program, self._folder, self._done = program, folder, done
+        self._program, self._folder, self._log_fn = program, folder, log_fn
         self._calls = 0
 
     @property
@@ -71,8 +77,14 @@ class Profiled:
             return self._program(state)
         with jax.profiler.trace(str(self._folder)):
             results = jax.block_until_ready(self._program(state))
-        self._done(shares(self._folder, scopes(self._program.as_text())))
+        self._log(shares(self._folder, scopes(self._program.as_text())))
         return results
+
+    def _log(self, shares: dict[str, float]) -> None:
+        write_json(self._folder / "shares.json", shares)
+        self._log_fn(f"a call of the training program, traced in {self._folder}:")
+        for name, share in shares.items():
+            self._log_fn(f"  {name:<9}{share:6.1%}  {MEANING[name]}")
 
 
 def scopes(program: str) -> dict[str, str]:

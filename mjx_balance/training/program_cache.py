@@ -46,7 +46,7 @@ CPU_OPTIONS: dict[str, str | bool] = {"xla_cpu_multi_thread_eigen": False}
 """Of XLA. Every core is a device: products that spread over all cores would only wait for those
 of the other devices."""
 
-Say: TypeAlias = Callable[[str], None]
+LogFn: TypeAlias = Callable[[str], None]
 """Takes one line for the user."""
 
 
@@ -56,7 +56,7 @@ def cache_dir() -> Path:
     return Path(os.environ.get("MJX_BALANCE_CACHE") or Path(base) / "mjx_balance")
 
 
-def enable_compilation_cache(say: Say) -> None:
+def enable_compilation_cache(log_fn: LogFn) -> None:
     """Turns XLA's persistent cache on for every program; call before compiling."""
     folder = cache_dir() / "xla"
     try:
@@ -64,14 +64,14 @@ def enable_compilation_cache(say: Say) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        say(f"nothing is cached, {folder} cannot be written: {error.strerror}")
+        log_fn(f"nothing is cached, {folder} cannot be written: {error.strerror}")
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 @contextlib.contextmanager
-def mending_xla_cache(say: Say) -> Iterator[None]:
+def mending_xla_cache(log_fn: LogFn) -> Iterator[None]:
     """Compile in here: what XLA finds damaged in its cache is said, and taken away.
 
     XLA compiles anew then, but would neither use nor replace the file.
@@ -89,7 +89,7 @@ def mending_xla_cache(say: Say) -> Iterator[None]:
         module = said.removeprefix(XLA_DAMAGED).partition("'")[0]
         for entry in (cache_dir() / "xla").glob(f"{module}-*-cache"):
             entry.unlink(missing_ok=True)
-        say(f"compiled anew: what {cache_dir() / 'xla'} had of {module} was damaged")
+        log_fn(f"compiled anew: what {cache_dir() / 'xla'} had of {module} was damaged")
 
 
 def versions() -> dict[str, str | None]:
@@ -128,7 +128,7 @@ def compiler_options() -> dict[str, str | bool]:
 
 
 def compile_program(
-    program: Callable[[Any], tuple[Any, Any]], state: Any, key: str | None, say: Say
+    program: Callable[[Any], tuple[Any, Any]], state: Any, key: str | None, log_fn: LogFn
 ) -> "CompiledProgram":
     """Compiles a jitted `state -> (state, output)`, from the cache where it can.
 
@@ -138,7 +138,7 @@ def compile_program(
       state: an example, on its devices.
       key: from `program_key`; none for a program that calls what only this process knows, and
         that can therefore not be kept.
-      say: told what is wrong with the cache.
+      log_fn: told what is wrong with the cache.
 
     Returns:
       The compiled program.
@@ -149,7 +149,7 @@ def compile_program(
         state, output = program(jax.tree.unflatten(structure, leaves))
         return jax.tree.leaves(state), output
 
-    traced = flat if key is None else _kept(flat, leaves, key, say)
+    traced = flat if key is None else _kept(flat, leaves, key, log_fn)
     lowered = jax.jit(traced, donate_argnums=0).lower(leaves)
     compiled = lowered.compile(compiler_options())
 
@@ -173,19 +173,19 @@ class CompiledProgram:
 
 
 def _kept(
-    flat: Callable[..., Any], leaves: list[jax.Array], key: str, say: Say
+    flat: Callable[..., Any], leaves: list[jax.Array], key: str, log_fn: LogFn
 ) -> Callable[..., Any]:
     """The traced program of that key, from its file or made and stored now."""
     path = cache_dir() / "programs" / f"{key}.stablehlo"
-    exported = _load(path, say)
+    exported = _load(path, log_fn)
     if exported is None:
         ours = [export.DisabledSafetyCheck.custom_call(name) for name in ffi.registered()]
         exported = export.export(jax.jit(flat, donate_argnums=0), disabled_checks=ours)(leaves)
-        _store(path, exported, say)
+        _store(path, exported, log_fn)
     return exported.call
 
 
-def _load(path: Path, say: Say) -> export.Exported | None:
+def _load(path: Path, log_fn: LogFn) -> export.Exported | None:
     """A traced program from its file, a digest and the program; none if it is not there."""
     try:
         content = path.read_bytes()
@@ -197,17 +197,17 @@ def _load(path: Path, say: Say) -> export.Exported | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        say(f"the cached program {path} is made anew: {error}")
+        log_fn(f"the cached program {path} is made anew: {error}")
         return None
 
 
-def _store(path: Path, exported: export.Exported, say: Say) -> None:
+def _store(path: Path, exported: export.Exported, log_fn: LogFn) -> None:
     program = bytes(exported.serialize())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, hashlib.sha256(program).digest() + program)
     except OSError as error:
-        say(f"the program is not cached, {path} cannot be written: {error.strerror}")
+        log_fn(f"the program is not cached, {path} cannot be written: {error.strerror}")
 
 
 def _initialize_lapack() -> None:

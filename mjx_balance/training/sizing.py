@@ -27,7 +27,7 @@ from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.policy.manifest import network_factors
 from mjx_balance.sim.engines.mujoco import cores
-from mjx_balance.training.program_cache import Say, cache_dir, enable_compilation_cache
+from mjx_balance.training.program_cache import LogFn, cache_dir, enable_compilation_cache
 
 SIZES_FILE = "sizes.json"
 """In the cache: numbers of envs by device and engine, as measured."""
@@ -51,12 +51,26 @@ LEARNER_COUNTED_IN_ENVS = (
 updates, each with more transitions: the replay ratio stays."""
 
 
-def configure_jax(say: Say) -> None:
-    """Makes every CPU core of this process a JAX device and turns the compilation cache on."""
+def configure_jax(log_fn: LogFn, num_cores: int | None = None) -> None:
+    """Makes CPU cores JAX devices and turns the compilation cache on.
+
+    Args:
+      log_fn: takes what is wrong with the cache.
+      num_cores: of each process; all that this one may use if None.
+
+    Raises:
+      ConfigError: if not all processes have the same number of devices.
+    """
     # Too late if JAX is already in use, as in a notebook: its devices do as they are.
     with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", cores())
-    enable_compilation_cache(say)
+        jax.config.update("jax_num_cpu_devices", num_cores or cores())
+    enable_compilation_cache(log_fn)
+    counts = [len(jax.local_devices(process_index=k)) for k in range(jax.process_count())]
+    if len(set(counts)) > 1:
+        raise ConfigError(
+            f"the processes have {counts} JAX devices; all must have the same number, as "
+            "CUDA_VISIBLE_DEVICES can make them"
+        )
 
 
 def size_to_device(config: Config, most: int | None = None) -> Config:
@@ -67,65 +81,78 @@ def size_to_device(config: Config, most: int | None = None) -> Config:
       most: envs to choose, for want of memory.
 
     Raises:
-      ConfigError: if the envs cannot be spread over that many devices.
+      ConfigError: if the engine does not run on it, or the envs cannot be spread over its devices.
     """
-    available = jax.devices()
-    on_cpu = available[0].platform == "cpu"
-    if config.engine == "mujoco" and not on_cpu:
-        raise ConfigError(
-            f"engine is mujoco, which runs on CPUs, and JAX uses {available[0].device_kind}; set "
-            "JAX_PLATFORMS=cpu, or choose engine mjx"
-        )
-    if config.engine == "warp" and available[0].platform not in ("cpu", "gpu", "cuda"):
-        raise ConfigError(
-            f"engine is warp, which runs on NVIDIA GPUs and CPUs, and JAX uses "
-            f"{available[0].device_kind}; choose engine mjx"
-        )
+    _check_engine(config.engine)
     if config.num_envs is None:
-        wanted = CPU_ENVS if on_cpu else measured_envs(config.engine) or ACCELERATOR_ENVS
-        config = widened(config, min(wanted, most or wanted))
-    num_envs, batch_size = config.num_envs, config.dqn.batch_size
-    assert num_envs is not None
-    num_devices, processes = config.num_devices, jax.process_count()
-    if num_devices is None:
-        num_devices = _even_share(len(available), processes, num_envs, batch_size)
-    elif num_devices > len(available):
-        raise ConfigError(
-            f"num_devices is {num_devices}; this machine has {len(available)} JAX devices"
-        )
-    if num_devices % processes:
-        raise ConfigError(
-            f"num_devices is {num_devices}; it must be a multiple of num_processes, {processes}"
-        )
-    for name, value in (("num_envs", num_envs), ("batch_size", batch_size)):
-        if value % num_devices:
-            raise ConfigError(
-                f"{name} is {value}; it must be a multiple of num_devices, {num_devices}"
-            )
+        config = scale_sizes(config, _default_envs(config.engine, most))
+    assert config.num_envs is not None
+    num_devices = _share_out(config.num_devices, config.num_envs, config.dqn.batch_size)
     return check(dataclasses.replace(config, num_devices=num_devices))
 
 
-def widened(config: Config, num_envs: int) -> Config:
-    """The config with so many envs, and as much more of everything that it does not say itself.
+def _check_engine(engine: str) -> None:
+    device = jax.devices()[0]
+    if engine == "mujoco" and device.platform != "cpu":
+        raise ConfigError(
+            f"engine is mujoco, which runs on CPUs, and JAX uses {device.device_kind}; set "
+            "JAX_PLATFORMS=cpu, or choose engine mjx"
+        )
+    if engine == "warp" and device.platform not in ("cpu", "gpu", "cuda"):
+        raise ConfigError(
+            f"engine is warp, which runs on NVIDIA GPUs and CPUs, and JAX uses "
+            f"{device.device_kind}; choose engine mjx"
+        )
 
-    That is every size that is still its preset's.
-    """
-    usual, scale = preset(config.preset), num_envs / CPU_ENVS
 
-    def more(own: Any, usual: Any, names: Sequence[str]) -> dict[str, int]:
+def _default_envs(engine: str, most: int | None) -> int:
+    if jax.devices()[0].platform == "cpu":
+        num_envs = CPU_ENVS
+    else:
+        num_envs = measured_envs(engine) or ACCELERATOR_ENVS
+    return min(num_envs, most or num_envs)
+
+
+def _share_out(num_devices: int | None, num_envs: int, batch_size: int) -> int:
+    """The number of devices, the same in every process, which share envs and batch evenly."""
+    available, processes = len(jax.devices()), jax.process_count()
+    if num_devices is None:
+        possible = range(available - available % processes, processes, -processes)
+        even = (n for n in possible if num_envs % n == batch_size % n == 0)
+        num_devices = next(even, processes)
+    if num_devices > available:
+        raise ConfigError(f"num_devices is {num_devices}; this machine has {available} JAX devices")
+    multiples = (
+        ("num_devices", num_devices, "num_processes", processes),
+        ("num_envs", num_envs, "num_devices", num_devices),
+        ("batch_size", batch_size, "num_devices", num_devices),
+    )
+    for name, value, divisor, size in multiples:
+        if value % size:
+            raise ConfigError(f"{name} is {value}; it must be a multiple of {divisor}, {size}")
+    return num_devices
+
+
+def scale_sizes(config: Config, num_envs: int) -> Config:
+    """The config with so many envs; every size that is still its preset's grows with them."""
+    defaults, scale = preset(config.preset), num_envs / CPU_ENVS
+
+    def scaled(own: Any, default: Any, names: Sequence[str]) -> dict[str, int]:
         values = {name: getattr(own, name) for name in names}
-        kept = {name: x for name, x in values.items() if x == getattr(usual, name)}
-        return {name: round(scale * x) for name, x in kept.items()}
+        return {k: round(scale * x) for k, x in values.items() if x == getattr(default, k)}
 
-    learner = more(config.dqn, usual.dqn, LEARNER_COUNTED_IN_ENVS)
-    own = more(config, usual, COUNTED_IN_ENVS)
-    dqn = dataclasses.replace(config.dqn, **learner)
-    return dataclasses.replace(config, num_envs=num_envs, dqn=dqn, **own)
+    dqn = scaled(config.dqn, defaults.dqn, LEARNER_COUNTED_IN_ENVS)
+    return dataclasses.replace(
+        config,
+        num_envs=num_envs,
+        dqn=dataclasses.replace(config.dqn, **dqn),
+        **scaled(config, defaults, COUNTED_IN_ENVS),
+    )
 
 
-def grown(wanted: Config, sized: Config) -> list[str]:
-    """What to tell the user of sizes that follow from the device: a line, or none."""
-    before, after = flatten(to_dict(wanted)), flatten(to_dict(sized))
+def describe_growth(config: Config, sized: Config) -> list[str]:
+    """The line for the user about sizes that follow from the device, if there are any."""
+    before, after = flatten(to_dict(config)), flatten(to_dict(sized))
     names = (*COUNTED_IN_ENVS, *LEARNER_COUNTED_IN_ENVS)
     changed = [f"{name} {after[name]:,}" for name in names if after[name] != before[name]]
     if not changed:
@@ -167,27 +194,10 @@ def _device(engine: str) -> str:
     return f"{jax.devices()[0].device_kind}, engine {engine}"
 
 
-def _even_share(available: int, processes: int, *counts: int) -> int:
-    """As many devices as share each of the counts out evenly, the same number in each process."""
-    possible = range(available - available % processes, processes, -processes)
-    return next((n for n in possible if not any(count % n for count in counts)), processes)
-
-
 def used_devices(num_devices: int) -> list[Any]:
-    """The devices of a run's mesh, the same number of every process, in their order.
-
-    Raises:
-      ConfigError: if one has fewer.
-    """
-    each, found = num_devices // jax.process_count(), []
-    for k in range(jax.process_count()):
-        own = jax.local_devices(process_index=k)
-        if len(own) < each:
-            raise ConfigError(
-                f"num_devices is {num_devices}, {each} per process; process {k} has {len(own)}"
-            )
-        found += own[:each]
-    return found
+    """The devices of a run's mesh, the same number of every process, in their order."""
+    each, processes = num_devices // jax.process_count(), range(jax.process_count())
+    return [x for k in processes for x in jax.local_devices(process_index=k)[:each]]
 
 
 def make_learner(config: Config, env: BalanceEnv) -> DQN:

@@ -24,7 +24,7 @@ from mjx_balance.policy.manifest import PolicyError, make_manifest
 from mjx_balance.policy.network import Policy
 from mjx_balance.sim.scene import Scene
 from mjx_balance.training.loop import number
-from mjx_balance.training.program_cache import Say
+from mjx_balance.training.program_cache import LogFn
 
 Results = dict[str, dict[str, Any]]
 """Suite name -> JSON of `evaluation.summarize`."""
@@ -116,20 +116,20 @@ def _validated(
     return scalars(results)
 
 
-def best_validated(folder: RunFolder, seed: int, say: Say) -> Path | None:
+def best_validated(folder: RunFolder, seed: int, log_fn: LogFn) -> Path | None:
     """The policy of a seed that validated best, the earliest of equals; none if there is none.
 
     Args:
       folder: of the run.
       seed: whose policies.
-      say: told of files that are damaged, which do not count.
+      log_fn: told of files that are damaged, which do not count.
     """
     found = []
     for file in folder.validated.glob(f"*/seed-{seed}.safetensors"):
         try:
             training = load_policy(file).manifest["training"]
         except PolicyError as error:
-            say(f"not chosen from: {error}")
+            log_fn(f"not chosen from: {error}")
             continue
         found.append((*score(training["validation"]), training["env_steps"], file))
     return min(found)[-1] if found else None

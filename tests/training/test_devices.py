@@ -59,7 +59,7 @@ def test_an_accelerator_gets_2048_envs_and_eight_times_of_what_is_counted_in_the
         dqn=CONFIG.dqn,
     )
     assert same == CONFIG, "nothing else"
-    assert sizing.grown(CONFIG, sized) == [
+    assert sizing.describe_growth(CONFIG, sized) == [
         "with num_envs 2,048 come num_env_steps 320,000, log_every 8,192, eval_every 160,000, "
         "batch_size 2,048, replay_capacity 1,048,576, min_replay_size 8,192, "
         "epsilon_decay_steps 40,000, whiten_steps 400,000; what you say stays"
@@ -76,7 +76,7 @@ def test_what_the_user_says_is_not_grown() -> None:
     assert sized.dqn.updates_per_step(2048) == 64
     with_envs = dataclasses.replace(CONFIG, num_envs=2_048)
     assert size_to_device(with_envs) == dataclasses.replace(with_envs, num_devices=1)
-    assert sizing.grown(with_envs, size_to_device(with_envs)) == []
+    assert sizing.describe_growth(with_envs, size_to_device(with_envs)) == []
 
 
 @pytest.mark.usefixtures("on_h100")
@@ -277,13 +277,13 @@ def test_envs_that_nobody_asked_for_are_halved_until_they_fit(
     with_spec = lambda config, env: types.SimpleNamespace(spec=config)  # noqa: E731
     monkeypatch.setattr(sizing, "make_learner", with_spec)
     monkeypatch.setattr(sizing, "check_memory", check)
-    sized, *_ = run._make(CONFIG)
+    sized, *_ = run._set_up(CONFIG)
     assert (sized.num_envs, sized.num_env_steps, sized.dqn.batch_size) == (256, 40_000, 256)
     with pytest.raises(ConfigError, match="too much"):
-        run._make(dataclasses.replace(CONFIG, num_envs=512))
+        run._set_up(dataclasses.replace(CONFIG, num_envs=512))
     monkeypatch.setattr(sizing, "CPU_ENVS", 512)
     with pytest.raises(ConfigError, match="too much"):
-        run._make(CONFIG)
+        run._set_up(CONFIG)
 
 
 def test_errors_of_a_running_program_are_explained_where_they_can_be() -> None:

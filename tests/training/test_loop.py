@@ -633,9 +633,13 @@ def test_a_run_begins_at_its_newest_checkpoint(
 ) -> None:
     sized = dataclasses.replace(PRESETS["smoke"], num_env_steps=4_096, num_devices=1, seed=5)
     learner: Any = Learner()
+    env: Any = None
 
     def go_on() -> Any:
-        return run_module._learn(sized, learner, folder, display, stop, lambda state: {})[0]
+        plan = make_plan(sized, BalanceEnv.metrics)
+        setup = run_module.Setup(sized, env, learner)
+        state, program = run_module.prepare(setup, plan, folder, display, stop)
+        return learn(plan, program, state, folder, display, stop, lambda state: {})[0]
 
     third = State(jnp.int32(3_072), jnp.int32(9), jnp.float32(100))
     checkpoints.save(folder.checkpoints, 1_024, start())

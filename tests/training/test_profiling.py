@@ -1,7 +1,7 @@
 """What a profile makes of a trace: whose an operation is, and how long it took by itself."""
 
+import json
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,13 +57,16 @@ def test_one_call_is_traced_and_gives_what_the_others_give(tmp_path: Path) -> No
 
     start = jnp.eye(300) / 2
     program = compile_program(jax.jit(step), start, None, pytest.fail)
-    found: list[Any] = []
-    profiled = Profiled(program, tmp_path, found.append)
+    lines: list[str] = []
+    profiled = Profiled(program, tmp_path, lines.append)
     sums = []
     for call in range(6):
         sums.append(float(profiled(start + 0)[1]))
-        assert len(found) == profiled.begun == (call >= 3)
+        assert bool(lines) == profiled.begun == (call >= 3)
         assert any(tmp_path.rglob("*.xplane.pb")) == (call >= 3)
     assert len(set(sums)) == 1
-    assert sum(found[0].values()) == pytest.approx(1)
-    assert found[0]["physics"] > 0.5 > 5 * found[0]["updates"] > 0
+    shares = json.loads((tmp_path / "shares.json").read_text())
+    assert sum(shares.values()) == pytest.approx(1)
+    assert shares["physics"] > 0.5 > 5 * shares["updates"] > 0
+    assert lines[0] == f"a call of the training program, traced in {tmp_path}:"
+    assert lines[1] == f"  physics  {shares['physics']:6.1%}  the engine's steps"

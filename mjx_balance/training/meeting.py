@@ -1,0 +1,173 @@
+"""How the processes of a run meet before JAX connects their devices, and notice one that dies.
+
+JAX does both by aborting with a native stack trace, which nothing in Python can catch:
+`jax.distributed.initialize` where a process never comes, its coordination service in all others
+where process 0 dies. So every process first connects to process 0, says who it is, gets one line
+back, and keeps the connection: it ends when the process at its other end does.
+"""
+
+import contextlib
+import json
+import os
+import queue
+import socket
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from mjx_balance.errors import FAILED, InputError
+from mjx_balance.files.text import MESSAGE, shorten
+
+PROGRAM = "mjx_balance"
+"""What a process of ours says first, within 5 s; whoever does not is a stranger."""
+LINE_BYTES, THREADS = 2**16, 100
+"""Longest line that is read; from so many threads on, connections wait to be asked."""
+KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 4, "TCP_USER_TIMEOUT": 30_000}
+"""A machine that answers nothing counts as gone after 30 s."""
+
+
+class ProcessError(InputError):
+    """Processes that cannot work together; the message says why."""
+
+
+def host(
+    address: tuple[str, int], count: int, about: Any, patience_s: float
+) -> tuple[dict[int, socket.socket], list[Any]]:
+    """Waits, as process 0, for all others.
+
+    Args:
+      address: IP and port to listen at; nothing listens anywhere else.
+      count: number of processes.
+      about: JSON value that all get to know of this one.
+      patience_s: time to wait, s.
+
+    Returns:
+      The connections to the others by their index, and `about` of all.
+
+    Raises:
+      ProcessError: in every process that has come, if another does not, or counts differently.
+    """
+    where, until = f"{address[0]} port {address[1]}", time.monotonic() + patience_s
+    connections: dict[int, socket.socket] = {}
+    abouts = {0: about}
+    hellos: queue.SimpleQueue[tuple[socket.socket, int, int, Any]] = queue.SimpleQueue()
+    refusal = ""
+    try:
+        family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        server = socket.create_server(address, family=family)
+    except OSError as error:
+        raise ProcessError(
+            f"process 0 cannot listen at {where}: {os.strerror(error.errno or 0)}"
+        ) from error
+    with server:
+        server.settimeout(0.1)
+        while len(abouts) < count and not refusal:
+            _accept(server, hellos)
+            if time.monotonic() > until:
+                missing = ", ".join(str(k) for k in range(count) if k not in abouts)
+                refusal = f"process {missing} has not come to {where} in {patience_s:g} s"
+            with contextlib.suppress(queue.Empty):
+                connection, index, others, value = hellos.get_nowait()
+                if others != count or index not in range(1, count) or index in abouts:
+                    refusal = (
+                        f"a process came to {where} as number {index} of {others}; process 0 waits "
+                        f"for {count}, and has met {sorted(connections)}"
+                    )
+                    index = -1
+                connections[index], abouts[index] = connection, value
+    if refusal:
+        _send(connections.values(), {"refusal": refusal})
+        for connection in connections.values():
+            connection.close()
+        raise ProcessError(refusal)
+    everyone = [abouts[k] for k in range(count)]
+    _send(connections.values(), {"everyone": everyone})
+    return connections, everyone
+
+
+def _accept(server: socket.socket, hellos: Any) -> None:
+    """Takes the next connection, if one comes, and lets a thread ask who it is."""
+
+    def ask(connection: socket.socket) -> None:
+        hello = _receive(connection, 5)
+        numbers = hello.get("index"), hello.get("count")
+        if hello.get("program") == PROGRAM and all(isinstance(x, int) for x in numbers):
+            hellos.put((connection, *numbers, hello.get("about")))
+        else:
+            connection.close()
+
+    with contextlib.suppress(OSError):
+        if threading.active_count() < THREADS:
+            threading.Thread(target=ask, args=(server.accept()[0],), daemon=True).start()
+
+
+def visit(
+    address: tuple[str, int], index: int, count: int, about: Any, patience_s: float
+) -> tuple[dict[int, socket.socket], list[Any]]:
+    """Comes to process 0, as process `index`, and waits for all others; otherwise as `host`."""
+    where, until = f"{address[0]} port {address[1]}", time.monotonic() + patience_s
+    while True:  # process 0 may be started later
+        try:
+            connection = socket.create_connection(address, timeout=5)
+            break
+        except OSError as error:
+            if time.monotonic() > until:
+                raise ProcessError(
+                    f"process 0 does not answer at {where} within {patience_s:g} s "
+                    f"({error.strerror or error}); is it started, and is that its address?"
+                ) from error
+            time.sleep(0.2)
+    _send([connection], {"program": PROGRAM, "index": index, "count": count, "about": about})
+    # Process 0 loses patience at about the same time, and knows who is missing.
+    answer = _receive(connection, until + 5 - time.monotonic())
+    if "everyone" not in answer:
+        connection.close()
+        left = f"process 0 has left the meeting at {where}"
+        raise ProcessError(shorten(answer.get("refusal", left), MESSAGE))
+    return {0: connection}, answer["everyone"]
+
+
+def _send(connections: Iterable[socket.socket], message: dict[str, Any]) -> None:
+    """Sends a line to all who are still there."""
+    for connection in connections:
+        with contextlib.suppress(OSError):
+            connection.sendall(json.dumps(message).encode() + b"\n")
+
+
+def _receive(connection: socket.socket, timeout_s: float | None) -> dict[str, Any]:
+    """The next line, a JSON object; empty if none comes."""
+    message = None
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        connection.settimeout(timeout_s)
+        message = json.loads(connection.makefile("rb").readline(LINE_BYTES))
+    return message if isinstance(message, dict) else {}
+
+
+class Watch:
+    """Ends this process with a sentence when another one of the run is gone."""
+
+    def __init__(self, connections: Mapping[int, socket.socket]):
+        """Listens to the connections of a meeting, each in a thread, until `end`."""
+        self.advice = ""
+        """What the sentence ends with."""
+        self._connections, self._ended = connections, threading.Lock()
+        for other, connection in connections.items():
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for name in KEEP_ALIVE.keys() & set(dir(socket)):  # not everywhere
+                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), KEEP_ALIVE[name])
+            threading.Thread(target=self._listen, args=(other, connection), daemon=True).start()
+
+    def end(self) -> None:
+        """Lets the others leave from now on."""
+        self._ended.acquire(blocking=False)
+
+    def _listen(self, other: int, connection: socket.socket) -> None:
+        """Waits until a connection ends, or until process 0 says which other one has."""
+        with connection:
+            lost = _receive(connection, None).get("lost", other)
+            if self._ended.acquire(blocking=False):
+                end = f"process {lost} is gone, and the run ends with it{self.advice}"
+                os.write(2, f"mjx-balance: {end}\n".encode())  # before JAX aborts
+                _send(self._connections.values(), {"lost": lost})
+                os._exit(FAILED)

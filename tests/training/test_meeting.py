@@ -1,0 +1,229 @@
+"""Processes that meet over sockets among strangers, and miss one another: here they are threads."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from mjx_balance.training import meeting
+from mjx_balance.training.meeting import ProcessError, Watch, host, visit
+
+Address = tuple[str, int]
+
+
+@pytest.fixture
+def address() -> Address:
+    """An address at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()
+
+
+@pytest.fixture
+def at_once() -> Callable[..., list[Any]]:
+    """Calls -> what each of them, in a thread of its own, returns or raises within 40 s."""
+
+    def at_once(*calls: Callable[[], Any]) -> list[Any]:
+        outcomes: list[Any] = [TimeoutError("it hangs")] * len(calls)
+
+        def work(k: int) -> None:
+            try:
+                outcomes[k] = calls[k]()
+            except Exception as error:
+                outcomes[k] = error
+
+        threads = [threading.Thread(target=work, args=(k,), daemon=True) for k in range(len(calls))]
+        until = time.monotonic() + 40
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(max(0.0, until - time.monotonic()))
+        return outcomes
+
+    return at_once
+
+
+@pytest.fixture
+def opened() -> Iterator[list[socket.socket]]:
+    """Connections to close at the end."""
+    connections: list[socket.socket] = []
+    yield connections
+    for connection in connections:
+        connection.close()
+
+
+def come(address: Address, index: int, count: int, opened: Any, patience_s: float = 20) -> Any:
+    """What a process gets to know of all."""
+    if index:
+        connections, everyone = visit(address, index, count, f"about {index}", patience_s)
+    else:
+        connections, everyone = host(address, count, "about 0", patience_s)
+    opened += connections.values()
+    return everyone
+
+
+def message(outcome: Any) -> str:
+    assert type(outcome) is ProcessError, outcome
+    return str(outcome)
+
+
+def test_all_get_to_know_of_all(address: Address, at_once: Any, opened: Any) -> None:
+    calls = [lambda k=k: come(address, k, 3, opened) for k in (2, 1, 0)]
+    assert at_once(*calls) == [["about 0", "about 1", "about 2"]] * 3
+
+
+def test_nobody_waits_for_ever(address: Address, at_once: Any, opened: Any) -> None:
+    where = f"127.0.0.1 port {address[1]}"
+    outcomes = at_once(*(lambda k=k: come(address, k, 3, opened, 1) for k in (0, 2)))
+    assert [message(x) for x in outcomes] == [f"process 1 has not come to {where} in 1 s"] * 2
+    [outcome] = at_once(lambda: come(address, 1, 2, opened, 0.5))
+    assert f"process 0 does not answer at {where} within 0.5 s" in message(outcome)
+
+
+@pytest.mark.parametrize(("index", "count"), [(1, 3), (2, 4)])
+def test_processes_that_count_differently_are_refused(
+    index: int, count: int, address: Address, at_once: Any, opened: Any
+) -> None:
+    """Two with the same number, and one that knows of another number of them."""
+
+    def late() -> Any:
+        time.sleep(0.6)
+        return come(address, index, count, opened)
+
+    outcomes = at_once(*(lambda k=k: come(address, k, 3, opened) for k in (0, 1)), late)
+    [sentence] = {message(x) for x in outcomes}
+    assert sentence == (
+        f"a process came to 127.0.0.1 port {address[1]} as number {index} of {count}; process 0 "
+        "waits for 3, and has met [1]"
+    )
+
+
+GREETING = b'{"program": "mjx_balance", '
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [],
+        [b"GET / HTTP/1.1\r\n"],
+        [b"[[1], 2]\n"],
+        [b"[1, 3]\n"],
+        [b'"ab"\n'],
+        [b"5\n"],
+        [b"[" * 60_000 + b"\n"],
+        [b"x" * 2**18],
+        [b"["] * 4,
+        [GREETING + b'"index": "1", "count": 2, "about": 0}\n'],
+        [GREETING + b'"index": [1], "count": {}}\n'],
+        [GREETING + b"}\n"],
+    ],
+    ids="idle http list count text number nested endless slow words lists empty".split(),
+)
+@pytest.mark.parametrize("strangers", [1, 4])
+def test_a_stranger_neither_ends_nor_blocks_the_meeting(
+    lines: list[bytes], strangers: int, address: Address, at_once: Any, opened: Any
+) -> None:
+    def stranger() -> None:
+        for _ in range(200):
+            try:
+                connection = socket.create_connection(address)
+                break
+            except OSError:
+                time.sleep(0.05)
+        else:
+            pytest.fail("nobody listens")
+        opened.append(connection)
+        try:
+            for line in lines:
+                connection.sendall(line)
+                time.sleep(0.1)
+        except OSError:
+            pass  # it has been dropped
+
+    def second() -> Any:
+        time.sleep(0.5)
+        return come(address, 1, 2, opened)
+
+    began = time.monotonic()
+    first = lambda: come(address, 0, 2, opened)  # noqa: E731
+    met = at_once(first, second, *[stranger] * strangers)[:2]
+    assert met == [["about 0", "about 1"]] * 2
+    assert time.monotonic() - began < 15
+
+
+def test_only_the_coordinators_address_is_listened_at(
+    address: Address, at_once: Any, opened: Any
+) -> None:
+    def elsewhere() -> str:
+        time.sleep(0.5)
+        with socket.create_connection(("127.0.0.2", address[1])):
+            return "heard"
+
+    outcomes = at_once(lambda: come(address, 0, 2, opened, 1), elsewhere)
+    assert type(outcomes[1]) is ConnectionRefusedError
+
+
+def test_a_port_that_is_taken_is_said(at_once: Any, opened: Any) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        [outcome] = at_once(lambda: come(("127.0.0.1", port), 0, 2, opened))
+    where = f"127.0.0.1 port {port}"
+    assert message(outcome) == f"process 0 cannot listen at {where}: Address already in use"
+
+
+@pytest.fixture
+def exits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Exit codes of the processes that would have ended."""
+    codes: list[int] = []
+    monkeypatch.setattr(meeting.os, "_exit", codes.append)
+    return codes
+
+
+@pytest.fixture
+def pairs() -> Iterator[list[tuple[socket.socket, socket.socket]]]:
+    """Process 0's connections to processes 1 and 2, with those at the other ends."""
+    connections = [socket.socketpair(socket.AF_UNIX) for _ in range(2)]
+    yield connections
+    for pair in connections:
+        for end in pair:
+            end.close()
+
+
+@pytest.fixture
+def tcp_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pairs of sockets that are no TCP know none of its options."""
+    monkeypatch.setattr(meeting, "KEEP_ALIVE", {})
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    until = time.monotonic() + 10
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.01)
+
+
+@pytest.mark.usefixtures("tcp_options")
+def test_a_lost_process_ends_all_with_a_sentence(
+    pairs: Any, exits: list[int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Also those that have no connection to it."""
+    (to_1, at_1), (to_2, at_2) = pairs
+    watches = [Watch({1: to_1, 2: to_2}), Watch({0: at_2})]
+    for watch in watches:
+        watch.advice = "; continue with --resume x"
+    at_1.close()
+    wait_for(lambda: len(exits) == 2)
+    assert exits == [1, 1]
+    sentence = "mjx-balance: process 1 is gone, and the run ends with it; continue with --resume x"
+    assert capfd.readouterr().err.splitlines() == [sentence] * 2
+
+
+@pytest.mark.usefixtures("tcp_options")
+def test_processes_may_leave_once_the_run_has_ended(pairs: Any, exits: list[int]) -> None:
+    (to_1, at_1), _ = pairs
+    watch = Watch({1: to_1})
+    watch.end()
+    at_1.close()
+    wait_for(lambda: to_1.fileno() == -1)
+    assert exits == []
