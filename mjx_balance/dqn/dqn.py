@@ -517,12 +517,12 @@ def step(env: Env, state: State, action: Int[Array, " envs"], key: PRNGKeyArray)
         terminated=after.done * (1 - truncation),
         next_obs=as_array(after.obs),
     )
-    finite = jax.vmap(all_finite)(transition)
+    finite: jax.Array = jax.vmap(all_finite)(transition)
     after = after.replace(done=jnp.where(finite, after.done, 1.0))  # pyright: ignore
     row = jnp.where(finite, jnp.arange(len(finite)), jnp.argmax(finite))
     valid = jax.lax.pmin(finite.any().astype(jnp.int32), AXIS) > 0
-    own = dict(after.metrics)
-    diverged = jnp.where(finite, own.pop("diverged", jnp.zeros_like(after.done)), 1.0)
+    own: dict[str, Any] = dict(after.metrics)
+    diverged: Any = jnp.where(finite, own.pop("diverged", jnp.zeros_like(after.done)), 1.0)
     means = {k: mean_where(x, finite) for k, x in (own | {"reward": after.reward}).items()}
     means["diverged"] = mean_where(diverged, jnp.ones_like(finite))
     after = reset_done(env.reset, after, key)
