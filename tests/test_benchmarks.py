@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
+from fixtures import probes
 from flax import linen as nn
 
 from mjx_balance.config import DQNConfig, TaskConfig

@@ -4,9 +4,9 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import probes
 import pytest
 from brax.envs.base import Env
+from fixtures import probes
 
 from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 from brax.envs.base import Env
+from fixtures import probes
 
 from mjx_balance.dqn import DQN
 from mjx_balance.dqn.dqn import step

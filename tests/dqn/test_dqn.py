@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
+from fixtures import probes
 from jax.experimental.key_reuse import _core as key_reuse
 
 from mjx_balance.config import SWEEPABLE

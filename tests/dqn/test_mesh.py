@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
+from fixtures import probes
 from jax.sharding import PartitionSpec
 
 from mjx_balance.config import DQNConfig

@@ -9,8 +9,8 @@ from typing import Any
 
 import jax
 import numpy as np
-import probes
 import pytest
+from fixtures import probes
 
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import DQN, DQNSpec, QNetwork

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
+from fixtures import probes
 
 from mjx_balance.dqn import replay
 from mjx_balance.dqn.replay import ReplayState, Transition, reflect
