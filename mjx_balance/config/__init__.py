@@ -1,6 +1,6 @@
-"""Every number of the task and the training, and whether they can go together.
+"""The config of a run: the numbers of task and training, presets, sweeps and consistency checks.
 
-A config is a frozen value. What depends on the robot is in `robots.limits`.
+Configs are frozen dataclasses. `robots.limits` adapts them to a robot and checks them against it.
 """
 
 from mjx_balance.config.presets import PRESETS, preset

@@ -32,9 +32,9 @@ PRESETS: Mapping[str, Config] = {
     # 64 envs: about what two cores step at the rate at which they learn.
     "paper": Config(preset="paper", num_envs=64),
     "default": Config(preset="default", num_env_steps=40_000, task=_TASK, dqn=_DQN),
-    # All IMU samples of the last three decisions, as means over 20 ms, and these decisions'
-    # commands, under noise of a data sheet, payloads, late actions and kicks: what `default` reads
-    # off tiny differences, this one has to average. The greater gamma is for the late actions.
+    # Inputs: all IMU samples of the last three decisions, as means over 20 ms, and the commands of
+    # these decisions. Sensor noise hides the small differences that `default` reads, so the inputs
+    # must be averaged. Noise is as in a data sheet. Delayed actions need the larger gamma.
     "best": Config(
         preset="best",
         num_env_steps=200_000,
@@ -54,8 +54,9 @@ PRESETS: Mapping[str, Config] = {
             push_max=0.4,
             push_period=2.5,
         ),
-        # `default`'s smaller batches at a higher rate cost an eighth of `corner`'s mean tilt here.
-        # Nobody can foresee a kick or a late action: squared, their TD errors drown all others.
+        # The smaller batches and the higher learning rate of `default` raise the mean tilt of
+        # `corner` by an eighth here. Pushes and delayed actions are unpredictable: the Huber loss
+        # keeps their TD errors from dominating all others.
         dqn=dataclasses.replace(
             _DQN,
             gamma=0.4,
@@ -68,7 +69,7 @@ PRESETS: Mapping[str, Config] = {
             huber_delta=0.03,
         ),
     ),
-    # Few decisions, each replayed often: a policy that balances within seconds.
+    # Few decisions, each replayed often: trains a policy within seconds.
     "quick": Config(
         preset="quick",
         num_env_steps=8_192,
@@ -96,7 +97,7 @@ PRESETS: Mapping[str, Config] = {
         ),
     ),
 }
-"""Named starting points of the command line."""
+"""Configs by name, for the flag `--preset`."""
 
 
 def preset(name: str) -> Config:

@@ -16,21 +16,25 @@ T = TypeVar("T")
 
 
 def to_dict(section: Any) -> dict[str, Any]:
-    """Returns a config, or a section of one, as plain JSON values."""
+    """Returns a config, a section of one, or another dataclass as plain JSON values."""
     return json.loads(json.dumps(dataclasses.asdict(section)))
 
 
 def from_dict(kind: type[T], values: Any) -> T:
-    """Rebuilds the config or section `kind` from `to_dict`'s values; what is missing is default.
+    """Builds a `kind` from `to_dict`'s values; missing fields take their defaults.
+
+    Args:
+      kind: `Config` or the class of a section.
+      values: JSON values.
 
     Raises:
-      ConfigError: for a field that `kind` does not have, or a value that is none of its field's.
+      ConfigError: if a field is unknown, or a value has the wrong type or is out of bounds.
     """
     return parse(kind, values, ConfigError)
 
 
 def flatten(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the fields of `to_dict`'s values without their sections; no two have one name."""
+    """Returns all fields of nested sections in one dict; field names are unique."""
     flat = {}
     for name, value in values.items():
         flat |= flatten(value) if isinstance(value, dict) else {name: value}
@@ -38,19 +42,19 @@ def flatten(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_config(file: Path) -> Config:
-    """Reads a run's config.json.
+    """Reads and checks a config.json.
 
     Raises:
-      ValueError: if it is no JSON, or no config that can be run.
+      ValueError: if the file is not JSON or not a valid config.
     """
     return check(from_dict(Config, read_json(file)))
 
 
 def read_run_config(path: Path) -> Config:
-    """Reads the config of an existing run that is not finished.
+    """Reads the config of an unfinished run.
 
     Raises:
-      RunFolderError: if `path` is no run folder, or its run is finished.
+      RunFolderError: if `path` is not a run folder, its run is finished, or its config is invalid.
     """
     file = unfinished_run(path).config
     try:
@@ -60,10 +64,10 @@ def read_run_config(path: Path) -> Config:
 
 
 def check_same_config(saved: Config, config: Config, path: Path) -> None:
-    """Refuses to resume the run in `path` as another one.
+    """Checks that the run in `path`, of config `saved`, is resumed with the same config.
 
     Raises:
-      RunFolderError: naming the first field that differs.
+      RunFolderError: names the first field that differs.
     """
     before = flatten(to_dict(saved))
     for name, value in flatten(to_dict(config)).items():

@@ -1,4 +1,4 @@
-"""A sweep: the runs that are trained side by side in one program."""
+"""Sweeps: several runs in one program that differ in seed and in numbers of the learner."""
 
 import dataclasses
 import itertools
@@ -11,18 +11,18 @@ SWEEPABLE = (
     *("learning_rate", "learning_rate_end_share", "gamma", "huber_delta", "max_grad_norm"),
     *("epsilon_start", "epsilon_end", "epsilon_decay_steps"),
 )
-"""Fields of `DQNConfig` that only enter into sums and products."""
+"""Fields of `DQNConfig` that may be arrays: they change no shape and no control flow."""
 WHOLE = ("epsilon_decay_steps",)
-"""Those of them that are whole numbers."""
+"""Integer fields among them."""
 
 
 def sweep_grid(config: Config) -> list[dict[str, float]]:
-    """Returns the combinations of a sweep's values, field -> value; one empty one without a sweep.
+    """Returns all combinations of the sweep's values as {field: value}, the last field fastest.
 
-    The last field varies fastest.
+    Without a sweep, that is one empty combination.
 
     Raises:
-      ConfigError: for an entry that names no field of `SWEEPABLE`, or lists no numbers.
+      ConfigError: if an entry names no field of `SWEEPABLE`, or lists no numbers.
     """
     fields: dict[str, list[float]] = {}
     for entry in config.sweep:
@@ -43,7 +43,7 @@ def sweep_grid(config: Config) -> list[dict[str, float]]:
 
 
 def with_values(dqn: DQNConfig, values: Mapping[str, float]) -> DQNConfig:
-    """Returns the learner's config with one combination of `sweep_grid`."""
+    """Returns `dqn` with the values of one combination of `sweep_grid`."""
     whole = {name: int(x) for name, x in values.items() if name in WHOLE and x.is_integer()}
     return dataclasses.replace(dqn, **{**values, **whole})
 
@@ -51,7 +51,7 @@ def with_values(dqn: DQNConfig, values: Mapping[str, float]) -> DQNConfig:
 def expand_runs(config: Config) -> list[Config]:
     """Returns the config of each run: every combination of the sweep with `num_seeds` seeds.
 
-    Seeds count on from run to run, so that no two runs have one name.
+    Run k has the seed `config.seed + k`, because results are named by seed.
     """
     repeated = [x for x in sweep_grid(config) for _ in range(config.num_seeds)]
     return [

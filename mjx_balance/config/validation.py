@@ -1,4 +1,4 @@
-"""Whether a config can be run, whatever its robot."""
+"""Checks of a config that do not depend on the robot."""
 
 from typing import Any
 
@@ -9,14 +9,14 @@ from mjx_balance.files.text import quote
 from mjx_balance.files.validation import check_types
 
 MOST_STEPS = 10_000
-"""Physics steps of a decision."""
+"""Greatest number of physics steps per decision."""
 
 
 def check(config: Config) -> Config:
-    """Returns `config` if it can be run with a robot that it suits (`robots.limits.check_robot`).
+    """Returns `config` if it is valid; `robots.limits.check_robot` checks it against its robot.
 
     Raises:
-      ConfigError: one sentence that names the first field that is wrong, its value and a remedy.
+      ConfigError: names the first invalid field, its value and a remedy.
     """
     if not isinstance(config, Config):
         raise ConfigError(

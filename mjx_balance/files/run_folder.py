@@ -1,11 +1,9 @@
-"""The files of a run's folder: their names, and whether they make a run. No JAX.
+"""The run folder: file names, atomic writes, the lock, and the checks before a resume. No JAX.
 
-Whatever is written here is written whole or not at all, so that a run can be killed at any
-moment and go on.
+All writes are atomic, so that a run can be killed at any moment and resumed.
 """
 
 import contextlib
-import dataclasses
 import json
 import os
 import shutil
@@ -23,103 +21,55 @@ else:
     import fcntl
 
 READ_AT_MOST = 2**20
-"""Bytes of a JSON file of a run; those of ours take some kilobytes."""
+"""Greatest size of a JSON file of a run, bytes; usual ones have some kilobytes."""
 
 
 class RunFolderError(InputError):
-    """A run folder that cannot be used; the message says why and what would do."""
+    """Unusable run folder; the message says why and names a remedy."""
 
 
-@dataclasses.dataclass(frozen=True)
 class RunFolder:
-    """Where everything of a run lies."""
+    """The paths in a run folder."""
 
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        return self.path / "config.json"
-
-    @property
-    def provenance(self) -> Path:
-        """What the run was started with besides its config: scene, engine, versions."""
-        return self.path / "provenance.json"
-
-    @property
-    def lock(self) -> Path:
-        """Held by the process that works on the run."""
-        return self.path / ".lock"
-
-    @property
-    def metrics(self) -> Path:
-        return self.path / "metrics.jsonl"
-
-    @property
-    def tensorboard(self) -> Path:
-        return self.path / "tensorboard"
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoints"
-
-    @property
-    def validated(self) -> Path:
-        """The policies validated during training, in folders named by the decisions made."""
-        return self.path / "validated"
+    def __init__(self, path: Path):
+        self.path = path
+        self.config = path / "config.json"
+        self.provenance = path / "provenance.json"
+        """Scene, engine and versions at the start of the run."""
+        self.lock = path / ".lock"
+        self.metrics = path / "metrics.jsonl"
+        self.tensorboard = path / "tensorboard"
+        self.checkpoints = path / "checkpoints"
+        self.validated = path / "validated"
+        """Policies validated during training, in folders named by env steps."""
+        self.seeds_summary = path / "seeds.json"
+        """With several seeds: evaluation and validation of each, and the choice among them."""
+        self.seeds = path / "seeds"
+        """With several seeds: the policy and evaluation of each."""
+        self.sweep = path / "sweep.json"
+        """Results of the combinations of a sweep, the best first."""
+        self.policy = path / "policy.safetensors"
+        self.evaluation = path / "evaluation.json"
+        self.figures = path / "figures"
+        self.profile = path / "profile"
+        """Trace of one call of the training program, on request."""
+        self.report = path / "report.json"
+        """Cached measurements of the report."""
 
     def validated_policy(self, seed: int, env_steps: int) -> Path:
-        """The policy of a seed after so many decisions."""
         return self.validated / str(env_steps) / f"seed-{seed}.safetensors"
 
-    @property
-    def seeds_summary(self) -> Path:
-        """Evaluation, validation and choice among several seeds."""
-        return self.path / "seeds.json"
-
-    @property
-    def sweep(self) -> Path:
-        """What each combination of a sweep's values has come to, the best first."""
-        return self.path / "sweep.json"
-
-    @property
-    def seeds(self) -> Path:
-        """Policy and evaluation of every seed, where there are several."""
-        return self.path / "seeds"
-
     def seed_policy(self, seed: int) -> Path:
-        """The policy of one of several seeds."""
         return self.seeds / f"seed-{seed}.safetensors"
-
-    @property
-    def policy(self) -> Path:
-        return self.path / "policy.safetensors"
-
-    @property
-    def evaluation(self) -> Path:
-        return self.path / "evaluation.json"
-
-    @property
-    def figures(self) -> Path:
-        return self.path / "figures"
-
-    @property
-    def profile(self) -> Path:
-        """A trace of one call of the training program, where one was asked for."""
-        return self.path / "profile"
-
-    @property
-    def report(self) -> Path:
-        """What the report measured, so that it need not be measured again."""
-        return self.path / "report.json"
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Writes a file whole or not at all, whenever the process or the machine dies.
+    """Writes a file atomically, even if the process or the machine dies.
 
-    Links are followed. A pipe or a device is written to, not replaced.
+    Follows links, and writes to pipes and devices directly.
 
     Raises:
-      OSError: if it cannot be written; what was there before is then still there, and no more.
+      OSError: if it cannot be written; the old content then stays.
     """
     data, part = content.encode() if isinstance(content, str) else content, None
     try:
@@ -137,27 +87,27 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         if part is not None:
             with contextlib.suppress(OSError):
                 part.unlink()
-        error.filename = str(path)  # what the user knows of
+        error.filename = str(path)  # the user knows no .part file
         raise
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Writes values as a JSON file, as `write_atomically`."""
+    """Writes a JSON file atomically."""
     write_atomically(path, json.dumps(values, indent=2) + "\n")
 
 
 def create_run_folder(
     path: Path, config: Mapping[str, Any], provenance: Mapping[str, Any]
 ) -> RunFolder:
-    """Makes a new run folder: it has all it takes to resume from the moment it exists.
+    """Creates a run folder with config and provenance; the rename at the end makes it atomic.
 
     Args:
-      path: of the folder.
-      config: of the run, in JSON values.
-      provenance: what else decides it, in JSON values; see `check_same_provenance`.
+      path: the folder.
+      config: JSON values.
+      provenance: JSON values; see `check_same_provenance`.
 
     Raises:
-      RunFolderError: if it exists or cannot be written; nothing is touched then.
+      RunFolderError: if the folder exists or cannot be written; nothing changes then.
     """
     if path.exists():
         raise RunFolderError(
@@ -165,7 +115,7 @@ def create_run_folder(
             f"--resume {path}"
         )
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)  # of a dead process of that number
+    shutil.rmtree(part, ignore_errors=True)  # left by a dead process with the same id
     try:
         part.mkdir(parents=True)
         write_json(RunFolder(part).config, config)
@@ -181,10 +131,10 @@ def create_run_folder(
 
 @contextlib.contextmanager
 def locked(folder: RunFolder) -> Iterator[None]:
-    """Keeps other processes out of a run; the lock goes when the process does, however it ends.
+    """Locks a run against other processes; the operating system unlocks it if this one dies.
 
     Raises:
-      RunFolderError: if another process works on the run.
+      RunFolderError: if another process holds the lock.
     """
     with folder.lock.open("a+b") as file:
         try:
@@ -198,15 +148,15 @@ def locked(folder: RunFolder) -> Iterator[None]:
                 "a new run with --run-dir"
             ) from error
         except OSError:
-            pass  # a file system that knows no locks
+            pass  # the file system has no locks
         yield
 
 
 def unfinished_run(path: Path) -> RunFolder:
-    """Finds a run to continue.
+    """Returns the folder of a run that can be resumed.
 
     Raises:
-      RunFolderError: if `path` is no run folder, or its run is finished.
+      RunFolderError: if `path` is not a run folder, or its run is finished.
     """
     folder = RunFolder(path)
     if not folder.config.is_file():
@@ -217,7 +167,11 @@ def unfinished_run(path: Path) -> RunFolder:
 
 
 def read_json(file: Path) -> Any:
-    """Reads a small JSON file of a run; raises ValueError for whatever is wrong with it."""
+    """Reads a JSON file of a run.
+
+    Raises:
+      ValueError: if the file is missing, unreadable, too large or not JSON.
+    """
     try:
         with file.open("rb") as opened:
             content = opened.read(READ_AT_MOST + 1)
@@ -232,7 +186,7 @@ def read_json(file: Path) -> Any:
 
 
 def parse_json(content: bytes) -> Any:
-    """Parses what a file holds; raises ValueError if it is no JSON, or nested too deep."""
+    """Parses JSON; raises ValueError if it is invalid or nested too deep."""
     try:
         return json.loads(content)
     except RecursionError as error:
@@ -242,17 +196,17 @@ def parse_json(content: bytes) -> Any:
 
 
 def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
-    """Compares what a run was started with, besides its config, with what there is today.
+    """Compares a run's saved provenance with today's.
 
     Args:
-      path: of the run's folder.
-      today: `versions` (library -> version), and whatever else decides the run, by name.
+      path: the run folder.
+      today: `versions` {library: version}, and by name all else that determines the run.
 
     Returns:
-      A sentence if only versions differ: the run may go on, though not to the same bits.
+      A warning if only versions differ, so that the run can go on, but not to the same bits.
 
     Raises:
-      RunFolderError: naming the first other thing that differs.
+      RunFolderError: if the saved file is invalid, or something else differs.
     """
     file = RunFolder(path).provenance
     try:
@@ -279,7 +233,7 @@ def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
 
 
 def keep_metrics_until(path: Path, env_steps: int) -> None:
-    """Drops lines that a resumed run will write again, and what a crash left half-written."""
+    """Drops the lines of metrics that a resumed run will write again, and incomplete lines."""
     if not path.is_file():
         return
     lines = []
@@ -291,7 +245,7 @@ def keep_metrics_until(path: Path, env_steps: int) -> None:
 
 
 def keep_validated_until(directory: Path, env_steps: int) -> None:
-    """Drops the policies that a resumed run will validate again, as `keep_metrics_until`."""
+    """Drops the policies that a resumed run will validate again."""
     for path in directory.glob("*"):
         if path.name.isdecimal() and int(path.name) > env_steps:
             shutil.rmtree(path)

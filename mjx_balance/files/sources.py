@@ -1,4 +1,4 @@
-"""The code of this package that a module consists of: its own, and whatever it imports."""
+"""The source code that a module depends on: its own, and that of its imports in this package."""
 
 import ast
 from pathlib import Path
@@ -7,14 +7,14 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def code(module: str, package: Path = PACKAGE) -> dict[str, str]:
-    """Finds what a module imports of this package, directly or not, wherever it does so.
+    """Collects a module and all that it imports from this package, directly or indirectly.
 
     Args:
       module: full dotted name.
       package: folder of mjx_balance.
 
     Returns:
-      Module -> its code without comments and docstrings, which decide nothing.
+      {module: code}, without comments and docstrings.
     """
     modules: dict[str, str] = {}
     _collect(package, module, modules)
@@ -27,9 +27,9 @@ def _collect(package: Path, name: str, modules: dict[str, str]) -> None:
         return
     inside = package.joinpath(*parts)
     file = inside / "__init__.py" if inside.is_dir() else inside.with_suffix(".py")
-    if not file.is_file():  # a name in a module
+    if not file.is_file():  # `name` is a name inside a module
         return
-    tree = _WithoutWords().visit(ast.parse(file.read_text(encoding="utf-8")))
+    tree = _DropDocstrings().visit(ast.parse(file.read_text(encoding="utf-8")))
     modules[name] = ast.unparse(tree)
     targets = [name.rpartition(".")[0]]
     for node in ast.walk(tree):
@@ -42,10 +42,7 @@ def _collect(package: Path, name: str, modules: dict[str, str]) -> None:
         _collect(package, target, modules)
 
 
-class _WithoutWords(ast.NodeTransformer):
-    """Takes docstrings out."""
-
+class _DropDocstrings(ast.NodeTransformer):
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
-        """Drops strings that stand alone."""
-        words = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-        return None if words else node
+        docstring = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if docstring else node

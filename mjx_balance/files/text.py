@@ -1,14 +1,14 @@
-"""Text from outside, made fit for one line of a message."""
+"""Shortens untrusted text to one line of a message."""
 
 MESSAGE = 300
-"""Characters of another library's error that a message repeats."""
+"""Greatest length of another library's error in a message, characters."""
 
 
 def shorten(text: object, limit: int = 80) -> str:
     """Returns text in one line of at most `limit` characters, without control characters.
 
     Args:
-      text: a text, or an error or a path to be read as one.
+      text: any object; its `str` counts.
       limit: greatest length; longer text ends in "...".
     """
     line = " ".join(str(text)[: 4 * limit].split())
@@ -18,8 +18,8 @@ def shorten(text: object, limit: int = 80) -> str:
 
 
 def quote(value: object, limit: int = 80) -> str:
-    """Returns a value as Python writes it, shortened."""
+    """Returns a value's `repr`, shortened."""
     try:
         return shorten(repr(value), limit)
-    except ValueError:  # an int of too many digits
+    except ValueError:  # an int with too many digits
         return "a number of thousands of digits"

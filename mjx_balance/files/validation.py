@@ -1,7 +1,7 @@
-"""Values from outside, checked by pydantic against the dataclass that describes them.
+"""Validates untrusted values with pydantic against dataclasses.
 
-A dataclass is checked strictly if its `__pydantic_config__` is `STRICT`: no value is converted, but
-for an int to a float and a JSON list to a tuple.
+Dataclasses with `__pydantic_config__ = STRICT` convert only an int to a float and a JSON list to a
+tuple.
 """
 
 import dataclasses
@@ -46,25 +46,25 @@ REMEDIES = {
     "too_long": "have a length of at most {max_length}",
     "missing": "have more entries",
 }
-"""What a value must do, by the type of pydantic's error and its numbers."""
+"""Type of pydantic's error -> how to complete "it must ..."; placeholders are pydantic's."""
 
 
 @functools.cache
 def _adapter(kind: Any) -> Any:
-    import pydantic  # takes longer than most of what `import mjx_balance` needs
+    import pydantic  # here, because it is slow to import and `import mjx_balance` can do without
 
     return pydantic.TypeAdapter(kind)
 
 
 def check_types(value: T, error: type[InputError] = InputError) -> T:
-    """Compares a dataclass with the types and bounds of its fields.
+    """Returns `value` if its fields have the types and bounds that its dataclass declares.
 
     Args:
-      value: of a dataclass; returned as it is.
+      value: instance of a dataclass.
       error: class to raise.
 
     Raises:
-      InputError: one sentence with the first field that is wrong, its value and what is right.
+      InputError: names the first invalid field, its value and what would be right.
     """
     try:
         _adapter(type(value)).validate_python(value)
@@ -84,10 +84,10 @@ def parse(
 
     Args:
       kind: the type.
-      values: as `json.loads` or `tomllib.loads` return them.
+      values: from `json.loads` or `tomllib.loads`.
       error: class to raise.
-      remedies: field -> what it must do, where a sentence of its own says it better.
-      name: of the values as a whole; the type's if none.
+      remedies: {field: end of "it must ..."}, where it differs from `REMEDIES`.
+      name: name of the value in messages; "": the type's.
 
     Raises:
       InputError: as `check_types`.
@@ -105,7 +105,7 @@ def parse(
 def _sentence(
     error: Any, kind: Any, value: Any, remedies: Mapping[str, str] | None = None, name: str = ""
 ) -> str:
-    """Field, value and what would be right, of the first of pydantic's errors."""
+    """The message of pydantic's first error: field, value and what would be right."""
     first = error.errors(include_url=False)[0]
     code, path, given = first["type"], first["loc"], first["input"]
     name, owner, subject = name or error.title, "", "it"
@@ -115,7 +115,7 @@ def _sentence(
         if code == "missing" and k == len(path) - 1 and isinstance(place, str):
             return f"{place}{owner} is missing"
         if child is None and given is not None:
-            break  # not a place in the value: one of several types, or an entry that is missing
+            break  # pydantic names a type of a union here, or an entry that is missing
         if isinstance(place, str):
             name, value = place, child
         elif isinstance(title, str):
@@ -140,7 +140,7 @@ def _sentence(
 
 
 def _child(value: Any, place: str | int) -> Any:
-    """A field or an entry of a value; None where there is none."""
+    """A field or an entry of a value, or None."""
     if isinstance(value, Mapping):
         return value.get(place)
     if isinstance(value, (list, tuple)):
