@@ -1,4 +1,4 @@
-"""The command line, `mjx-balance`: one module per command, imported when it is called."""
+"""The command line, `mjx-balance`: one module per command, imported when it runs."""
 
 import importlib
 import sys
@@ -15,17 +15,17 @@ COMMANDS = {
     "view": "view:view",
     "robot": "robot:robot",
 }
-"""Command -> module of this package and its function, from arguments to exit code."""
+"""Command -> `module:function` of this package; functions return an exit code."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command.
 
     Args:
-      arguments: of the command line, without the program's name; `sys.argv` if None.
+      arguments: of the command line, without the program's name; those of `sys.argv` if None.
 
     Returns:
-      The exit code: 0, 2 for input that cannot be used, 1 for other failures, 130 if interrupted.
+      The exit code: 0, 1 for failures, 2 for invalid input, 130 after Ctrl-C.
     """
     from mjx_balance.cli.common import HELP, complain
 

@@ -1,4 +1,4 @@
-"""What several commands share."""
+"""Functions that several commands use."""
 
 import sys
 from pathlib import Path
@@ -21,15 +21,15 @@ def complain(message: str, code: int = USAGE_ERROR) -> int:
 
 
 def check_out(name: str, path: Path | None, suffix: str = "") -> None:
-    """Refuses an output file that cannot be written, before the work begins.
+    """Checks before the work begins that an output file can be written.
 
     Args:
       name: of the flag.
-      path: given by the user; None passes.
-      suffix: that the file's name must have.
+      path: of the file; None passes.
+      suffix: of the file's name; empty if any will do.
 
     Raises:
-      InputError: if the name has another suffix, or the folder does not exist.
+      InputError: if the suffix differs, the path is a folder, or its folder does not exist.
     """
     if path is None:
         return
@@ -44,17 +44,20 @@ def check_out(name: str, path: Path | None, suffix: str = "") -> None:
 def load_controller(
     policy: Path | None, baseline: str | None, robot: str | None
 ) -> tuple[Scene, Controller]:
-    """Loads a policy or builds a baseline, with its scene.
+    """Loads a policy or builds a baseline.
 
     Args:
       policy: file, run folder or name of a shipped policy.
-      baseline: name of a controller; exactly one of the two is given.
-      robot: of the baseline, or where the policy's robot is found on this machine.
+      baseline: name of a controller; exactly one of policy and baseline is not None.
+      robot: the baseline's robot, or the path of the policy's robot file on this machine.
+
+    Returns:
+      Scene and controller.
 
     Raises:
-      ControllerError: if both or neither of policy and baseline are given.
+      ControllerError: if both or neither of policy and baseline are None.
       PolicyError: if the policy cannot be used.
-      ConfigError: if there is no such robot.
+      ConfigError: if the robot does not exist.
     """
     if (policy is None) == (baseline is None):
         raise ControllerError("name a policy file or --controller NAME, one of the two")

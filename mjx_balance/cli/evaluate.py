@@ -18,27 +18,27 @@ from mjx_balance.sim.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateArgs:
-    """Evaluate an exported policy in plain MuJoCo on all cores. Needs no JAX."""
+    """Evaluate a policy in plain MuJoCo on all cores. Needs no JAX."""
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
     """Policy file, run folder, or the name of a shipped policy."""
     controller: str | None = None
     """Baseline to evaluate instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     robot: str | None = None
-    """Robot of the baseline; of a policy, where its robot's file is now."""
+    """Robot of the baseline, or the new path of the policy's robot file."""
     suite: str = "paper"
     """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast or
     steep."""
     scenarios: int = 256
-    """How many of them."""
+    """Number of scenarios."""
     duration: float = 60.0
-    """Length of each, s."""
+    """Length of a scenario, s."""
     seed: int = 0
-    """Seed that draws them."""
+    """Seed of the scenarios."""
     json: Path | None = None
-    """File to write the figures to."""
+    """JSON file to write the results to."""
     video: Path | None = None
-    """MP4 to write of the first scenario."""
+    """MP4 file to write, a video of the first scenario."""
 
 
 def evaluate(argv: list[str]) -> int:

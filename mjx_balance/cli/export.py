@@ -15,7 +15,7 @@ from mjx_balance.policy.manifest import FORMAT_VERSION
 
 @dataclasses.dataclass(frozen=True)
 class ExportArgs:
-    """Write a policy as an ONNX model (needs the package onnx), or in today's file format."""
+    """Write a policy as an ONNX model (needs the package onnx), or in the current file format."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Policy file, run folder, or the name of a shipped policy."""

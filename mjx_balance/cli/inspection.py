@@ -1,4 +1,4 @@
-"""What `mjx-balance robot check` says of a robot: built, stood on the board, tilted. No JAX."""
+"""The tests of `mjx-balance robot check`: a robot stands on the board, which tilts. No JAX."""
 
 import itertools
 import math
@@ -16,37 +16,37 @@ from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
 
 MAX_CREEP = 0.01
-"""Of a robot that stands still, m/s."""
+"""Greatest speed of a robot that counts as standing still, m/s."""
 NO_TORQUE_LEFT = 0.99
-"""Share of its torque from which a servo has none left."""
+"""Share of a servo's torque limit at which it has no reserve left."""
 TILT_SECONDS, REST_SECONDS = 3.0, 1.0
-"""Time to turn the board, and to watch the robot at rest then, s."""
+"""Time in which the board turns, then in which it rests, s."""
 
 
 class TiltTest(NamedTuple):
-    """A robot that its legs keep level on a board held at the greatest incline on both axes.
-
-    The worst of four: the board turned either way about each axis.
-    """
+    """The worst of four tilt tests: the board turns either way about each axis."""
 
     torque_share: np.ndarray
-    """(legs, 3) of each servo's limit that it takes at most."""
+    """(legs, 3) greatest torque of each servo, as a share of its limit."""
     tilt: float
-    """Of the body at the end, at most, deg."""
+    """Greatest body tilt at the end, deg."""
     creep: float
-    """What the trunk moves by meanwhile, at most, m/s: regularised friction gives way."""
+    """Greatest mean speed of the trunk at rest, m/s: feet creep under regularised friction."""
     qpos: np.ndarray
-    """(nq,) at the end, where a servo has most to do."""
+    """(nq,) final state of the test with the greatest torque."""
 
 
 def inspect(robot: str) -> tuple[Scene, TiltTest]:
-    """Builds a robot's scene and tilts it.
+    """Builds a robot's scene and runs the tilt test.
 
     Args:
       robot: as `config.robot`.
 
+    Returns:
+      The scene and the result of the test.
+
     Raises:
-      ConfigError: if it cannot be built, or does not stand.
+      ConfigError: if the robot cannot be built or does not stand.
     """
     config = check(for_robot(preset("default"), robot))
     scene = load_scene(config)
@@ -54,18 +54,18 @@ def inspect(robot: str) -> tuple[Scene, TiltTest]:
 
 
 def tilt_board(scene: Scene) -> TiltTest:
-    """Turns the board to `max_incline` on both axes, the body kept level by geometry alone."""
-    found = [_tilt_board(scene, np.asarray(ways)) for ways in itertools.product((1, -1), repeat=2)]
+    """Turns the board to `max_incline` on both axes; the legs level the body by geometry alone."""
+    tests = [_tilt_board(scene, np.asarray(ways)) for ways in itertools.product((1, -1), repeat=2)]
     return TiltTest(
-        torque_share=np.max([one.torque_share for one in found], axis=0),
-        tilt=max(one.tilt for one in found),
-        creep=max(one.creep for one in found),
-        qpos=max(found, key=lambda one: one.torque_share.max().round(3)).qpos,
+        torque_share=np.max([one.torque_share for one in tests], axis=0),
+        tilt=max(one.tilt for one in tests),
+        creep=max(one.creep for one in tests),
+        qpos=max(tests, key=lambda one: one.torque_share.max().round(3)).qpos,
     )
 
 
 def _tilt_board(scene: Scene, ways: np.ndarray) -> TiltTest:
-    """With the board turned one way, (2,) +-1 about its X and Y."""
+    """One tilt test; `ways` (2,) is +-1, the direction about the board's X and Y."""
     model, task, robot = scene.model, scene.config.task, scene.robot
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = scene.stance.qpos, scene.stance.qvel
@@ -74,7 +74,7 @@ def _tilt_board(scene: Scene, ways: np.ndarray) -> TiltTest:
     steps = round(TILT_SECONDS / task.sim_dt)
     angle = math.radians(task.max_incline)
     root = scene.trunk_quat[0] - 3
-    rested = data.qpos[root : root + 3].copy()
+    rest_pos = data.qpos[root : root + 3].copy()
     for k in range(steps + round(REST_SECONDS / task.sim_dt)):
         share = min(1.0, (k + 1) / steps)
         data.ctrl[scene.board_ctrl] = share * angle * ways
@@ -82,45 +82,45 @@ def _tilt_board(scene: Scene, ways: np.ndarray) -> TiltTest:
         data.ctrl[scene.leg_ctrl] = joint_angles(robot, heights) + scene.stance.leg_trim
         mujoco.mj_step(model, data)
         if k == steps:
-            rested = data.qpos[root : root + 3].copy()
+            rest_pos = data.qpos[root : root + 3].copy()
     limits = model.actuator_forcerange[scene.leg_ctrl, 1]
     return TiltTest(
         torque_share=np.abs(data.actuator_force[scene.leg_ctrl]) / limits,
         tilt=float(body_tilt(data.qpos[scene.trunk_quat])),
-        creep=float(np.linalg.norm(data.qpos[root : root + 3] - rested)) / REST_SECONDS,
+        creep=float(np.linalg.norm(data.qpos[root : root + 3] - rest_pos)) / REST_SECONDS,
         qpos=data.qpos.copy(),
     )
 
 
 def problems(scene: Scene, tilt_test: TiltTest) -> list[str]:
-    """Why it is not ready to be trained, a sentence each; empty if it is."""
-    task, found = scene.config.task, []
+    """Reasons why the robot is not ready for training, one sentence each."""
+    task, sentences = scene.config.task, []
     if tilt_test.tilt > task.fail_tilt:
-        found.append(
+        sentences.append(
             f"robot {scene.robot.name} does not hold itself level at {task.max_incline:g} deg on "
             f"both axes: its body tilts to {tilt_test.tilt:.1f} deg, and {task.fail_tilt:g} is a "
             "fall"
         )
     joint, share = _most_loaded(scene, tilt_test)
     if share >= NO_TORQUE_LEFT:
-        found.append(
+        sentences.append(
             f"robot {scene.robot.name} has no torque left at {task.max_incline:g} deg on both "
             f"axes: {joint!r} takes {100 * share:.0f}% of its own"
         )
-    return found
+    return sentences
 
 
 def _most_loaded(scene: Scene, tilt_test: TiltTest) -> tuple[str, float]:
-    """The servo, and the share of its torque that it takes; of mirror images, the first."""
+    """Name and torque share of the most loaded servo; the first of equally loaded ones."""
     leg, joint = np.unravel_index(np.argmax(tilt_test.torque_share.round(3)), (4, 3))
     return scene.robot.legs[leg].joints[joint], float(tilt_test.torque_share.max())
 
 
 def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
-    """What was found, line by line."""
+    """Describes the robot and the result of its tilt test, line by line."""
     robot, config = scene.robot, scene.config
     low, high = robot.height_range
-    lines = [
+    return [
         f"{robot.name}: {robot.total_mass:.2f} kg, of which the trunk {robot.trunk_mass:.2f}",
         f"stands at {_mm(config.task.body_height)}; its legs reach from {_mm(low)} to {_mm(high)}",
         f"servos {robot.servo_stiffness:g} N m/rad, {robot.servo_damping:g} N m s/rad; limits "
@@ -131,7 +131,6 @@ def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
         *_abilities(config, robot),
         *_standing(scene, tilt_test),
     ]
-    return lines
 
 
 def _legs(robot: Robot) -> list[str]:

@@ -14,12 +14,12 @@ from mjx_balance.files.run_folder import write_atomically
 
 @dataclasses.dataclass(frozen=True)
 class RobotCheckArgs:
-    """Build a robot, tilt it, and say what was found."""
+    """Build a robot, tilt it on the board, and print the results."""
 
     robot: Annotated[str, tyro.conf.Positional]
     """TOML file, shipped robot's name, or menagerie:NAME."""
     picture: Path | None = None
-    """PNG to draw it to; none: NAME-check.png in this folder, whatever is there."""
+    """PNG file to draw; none: NAME-check.png in this folder, which is overwritten."""
 
 
 @dataclasses.dataclass(frozen=True)

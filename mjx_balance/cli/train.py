@@ -23,22 +23,22 @@ class TrainArgs:
     resume: Path | None = None
     """Run folder to continue instead."""
     profile: bool = False
-    """Trace a call of the training program, and tell what share of it each part takes."""
+    """Trace a call of the training program and print the share of time that each part takes."""
     distributed: bool = False
-    """Be one of several processes, on one machine or many, that Slurm, Open MPI or Kubernetes has
-    started; or one that the next three flags place. All get the same other flags."""
+    """Train with several processes, which Slurm, Open MPI or Kubernetes starts on one machine or
+    many. Without them, use the next three flags. Give all processes the same other flags."""
     coordinator: str | None = None
-    """HOST:PORT at which process 0 listens, where no cluster says so."""
+    """HOST:PORT at which process 0 listens; none: the cluster sets it."""
     process_id: int | None = None
-    """Number of this process, from 0."""
+    """Index of this process, from 0."""
     num_processes: int | None = None
-    """How many there are."""
+    """Number of processes."""
     config: tyro.conf.OmitArgPrefixes[Config] = dataclasses.field(default_factory=Config)
 
 
 @dataclasses.dataclass(frozen=True)
 class StartingPoint:
-    """The flags that the defaults of all others depend on."""
+    """The flags that set the defaults of all others."""
 
     preset: str = "default"
     robot: str = "quadruped"
@@ -46,7 +46,7 @@ class StartingPoint:
 
 
 def sweep(argv: list[str]) -> int:
-    """Runs `mjx-balance sweep gamma=0.1,0.4 @FILE ... [flags of train]`, a train with `--sweep`."""
+    """Runs `mjx-balance sweep gamma=0.1,0.4 @FILE ... [flags]`, which is `train --sweep`."""
     count = next((k for k, text in enumerate(argv) if text.startswith("-")), len(argv))
     entries = []
     for text in argv[:count]:
@@ -81,7 +81,7 @@ def train(argv: list[str]) -> int:
 
 
 def _parse(argv: list[str]) -> TrainArgs:
-    """The flags; what they leave out is the preset's, the robot's or the resumed run's."""
+    """Parses the flags; defaults are those of preset and robot, or of the run to resume."""
     start, _ = tyro.cli(StartingPoint, args=argv, return_unknown_args=True, add_help=False)
     if start.resume is None:
         default = TrainArgs(config=for_robot(preset(start.preset), start.robot))
@@ -113,7 +113,7 @@ def _train(args: TrainArgs) -> int:
         if explanation is None:
             raise
         return complain(explanation, FAILED)
-    except OSError as error:  # a full disk: what is saved stays, and can be resumed
+    except OSError as error:  # a full disk: --resume can go on from what is saved
         return complain(f"cannot write {error.filename or 'the run'}: {error.strerror}", FAILED)
     except run.Interrupted as stopped:
         display.say(str(stopped))

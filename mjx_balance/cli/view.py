@@ -11,18 +11,18 @@ from mjx_balance.cli.common import complain, load_controller
 
 @dataclasses.dataclass(frozen=True)
 class ViewArgs:
-    """Watch a policy in MuJoCo's viewer; tilt the board and kick the robot by keys."""
+    """Watch a policy in MuJoCo's viewer; keys tilt the board and push the robot."""
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
     """Policy file, run folder, or the name of a shipped policy."""
     controller: str | None = None
     """Baseline to watch instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     robot: str | None = None
-    """Robot of the baseline; of a policy, where its robot's file is now."""
+    """Robot of the baseline, or the new path of the policy's robot file."""
     suite: str | None = None
-    """Suite whose boards and kicks to show; none: those of the keys."""
+    """Suite that moves the board and pushes the robot; none: keys do."""
     seed: int = 0
-    """Seed that draws them."""
+    """Seed of the suite's scenarios, and of the direction of pushes by key."""
 
 
 def view(argv: list[str]) -> int:
@@ -39,7 +39,7 @@ def view(argv: list[str]) -> int:
     except render.RenderError as error:
         return complain(f"{error}; `mjx-balance evaluate --video` needs no display")
     corners = mujoco.mjtGridPos
-    keys = "Enter: kick" if args.suite else viewing.HELP
+    keys = "Enter: push" if args.suite else viewing.HELP
     try:
         while window.is_open:
             window.write(

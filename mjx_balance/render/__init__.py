@@ -1,1 +1,1 @@
-"""Pictures and windows of a scene."""
+"""Pictures, videos and windows of a scene."""

@@ -1,9 +1,8 @@
-"""Pictures and videos of a rollout, drawn offscreen, and a window to watch one in. No JAX.
+"""Renders rollouts offscreen to pictures and videos, and plays them in a window. No JAX.
 
-MuJoCo chooses its OpenGL backend when it is imported, and a backend that does not
-work can take the process with it. So the drawing is done by this file in a process
-of its own, with EGL first and then OSMesa (`python -m mjx_balance.render.drawing`). A window's
-OpenGL is the display's, whatever the backend.
+MuJoCo chooses its OpenGL backend on import, and a broken backend can crash the process. So this
+file renders in a child process (`python -m mjx_balance.render.drawing`): first with EGL, then with
+OSMesa. A window always uses the display's OpenGL.
 """
 
 import contextlib
@@ -32,23 +31,23 @@ VIDEO_SIZE = (960, 544)
 PICTURE_SIZE = (1280, 720)
 BACKENDS = ("egl", "osmesa")
 CHILD = (sys.executable, "-m", "mjx_balance.render.drawing")
-UNWRITTEN = 3
-"""What that process ends with if it could draw, but not write."""
+WRITE_FAILED = 3
+"""Exit code of the child process if it can draw but not write."""
 
 
 class RenderError(RuntimeError):
-    """No picture can be drawn on this machine; the message says why."""
+    """This machine cannot draw pictures or open a window; the message says why."""
 
 
 def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") -> None:
-    """Draws states to a file: `.png` the first of them, anything else all as a video.
+    """Draws the first state to a `.png` file, or all states to a video.
 
-    The file is written whole or not at all.
+    The write is atomic.
 
     Args:
-      path: file to write; a video plays at real speed.
-      config: gives the scene and the time step.
-      qpos: (steps, nq), one per physics step, of the scene with or without its looks.
+      path: file to write; any suffix but `.png` makes a video, at real speed.
+      config: defines the scene and the time step.
+      qpos: (steps, nq), one state per physics step.
       camera: a camera of scene.xml.
 
     Raises:
@@ -56,8 +55,8 @@ def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") ->
     """
     stride = frame_stride(config)
     with tempfile.TemporaryDirectory() as folder:
-        job, drawn = Path(folder) / "job.npz", Path(folder) / f"drawn{path.suffix}"
-        header = {"config": to_dict(config), "camera": camera, "path": str(drawn)}
+        job, picture = Path(folder) / "job.npz", Path(folder) / f"picture{path.suffix}"
+        header = {"config": to_dict(config), "camera": camera, "path": str(picture)}
         header["fps"] = 1 / (stride * config.task.sim_dt)
         np.savez(job, qpos=qpos[::stride], header=json.dumps(header))
         reason = ""
@@ -65,24 +64,24 @@ def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") ->
             command = [*CHILD, str(job)]
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
             reason = done.stderr
-            if done.returncode == UNWRITTEN:
+            if done.returncode == WRITE_FAILED:
                 raise RenderError(f"{path} cannot be written: {_last_line(reason)}")
             if done.returncode == 0:
                 try:
-                    return write_atomically(path, drawn.read_bytes())
+                    return write_atomically(path, picture.read_bytes())
                 except OSError as error:
                     raise RenderError(f"{path} cannot be written: {error.strerror}") from error
-    raise _failed(reason)
+    raise _render_error(reason)
 
 
 class Painter:
-    """Draws one state after the other, in a process of its own that stays until `close`."""
+    """Draws states one by one in a child process, which runs until `close`."""
 
     def __init__(self, config: Config, camera: str = "main"):
         """Starts the process.
 
         Args:
-          config: gives the scene.
+          config: defines the scene.
           camera: a camera of scene.xml.
 
         Raises:
@@ -91,24 +90,32 @@ class Painter:
         header = json.dumps({"config": to_dict(config), "camera": camera})
         reason = ""
         for environment in _environments():
-            self._said = tempfile.TemporaryFile()  # noqa: SIM115 closed by _end
+            self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 closed by _end
             pipe = subprocess.PIPE
             self._child: Any = subprocess.Popen(
-                CHILD, env=environment, stdin=pipe, stdout=pipe, stderr=self._said
+                CHILD, env=environment, stdin=pipe, stdout=pipe, stderr=self._stderr
             )
-            with contextlib.suppress(BrokenPipeError):  # it is gone already: nothing is answered
+            with contextlib.suppress(
+                BrokenPipeError
+            ):  # the child has died: the read returns nothing
                 self._child.stdin.write(header.encode() + b"\n")
                 self._child.stdin.flush()
             if self._child.stdout.read(1):
                 return
             reason = self._end()
-        raise _failed(reason)
+        raise _render_error(reason)
 
     def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """A picture (height, width, 3), uint8, of a state (nq,) with or without its looks.
+        """Draws a state.
+
+        Args:
+          qpos: (nq,).
+
+        Returns:
+          (height, width, 3) RGB picture, uint8.
 
         Raises:
-          RenderError: if the process has ended.
+          RenderError: if the child process has died.
         """
         width, height = VIDEO_SIZE
         picture = b""
@@ -117,37 +124,37 @@ class Painter:
             self._child.stdin.flush()
             picture = self._child.stdout.read(height * width * 3)
         if len(picture) < height * width * 3:
-            raise _failed(self._end())
+            raise _render_error(self._end())
         return np.frombuffer(picture, np.uint8).reshape(height, width, 3).copy()
 
     def close(self) -> None:
         """Ends the process."""
-        if not self._said.closed:
+        if not self._stderr.closed:
             self._end()
 
     def _end(self) -> str:
-        """Ends the process; returns what it said."""
+        """Ends the process; returns its stderr."""
         with contextlib.suppress(BrokenPipeError):
             self._child.stdin.close()
         self._child.stdout.close()
         self._child.wait()
-        with self._said:
-            self._said.seek(0)
-            return self._said.read().decode(errors="replace")
+        with self._stderr:
+            self._stderr.seek(0)
+            return self._stderr.read().decode(errors="replace")
 
 
 class Window:
-    """MuJoCo's viewer, in which states are played at real speed. A closed one stays closed."""
+    """MuJoCo's viewer; plays states at real speed."""
 
     def __init__(self, config: Config, on_key: Callable[[int], None] | None = None):
         """Opens the window.
 
         Args:
-          config: gives the scene.
-          on_key: told of every key that is pressed, by GLFW's code.
+          config: defines the scene.
+          on_key: called with the GLFW code of every key that the user presses.
 
         Raises:
-          RenderError: if there is no display to open it on, or macOS wants another Python.
+          RenderError: if there is no display, or macOS needs `mjpython`.
         """
         _check_display()
         import mujoco.viewer
@@ -164,7 +171,7 @@ class Window:
                 show_left_ui=False,
                 show_right_ui=False,
             )
-        except RuntimeError as error:  # on macOS windows belong to the main thread
+        except RuntimeError as error:  # macOS opens windows on the main thread only
             raise RenderError(
                 f"no window can be opened here ({error}); start it by mjpython, as `mjpython -m "
                 "mjx_balance view best`"
@@ -174,7 +181,7 @@ class Window:
         self._next = time.monotonic()
 
     def play(self, qpos: np.ndarray) -> None:
-        """Shows states (steps, nq), one per physics step; returns when they are over."""
+        """Plays states (steps, nq), one per physics step; returns after the last one."""
         for state in qpos[(len(qpos) - 1) % self._stride :: self._stride]:
             if not self._viewer.is_running():
                 return
@@ -182,20 +189,20 @@ class Window:
                 self._data.qpos[:] = state
                 mujoco.mj_forward(self._model, self._data)
             self._viewer.sync()
-            # What came between two calls is part of the pause, and time lost is not made up for.
+            # The caller's work counts toward the pause; a late frame delays all that follow.
             now = time.monotonic()
             self._next = max(now, self._next + self._pause)
             time.sleep(self._next - now)
 
     def write(self, *texts: tuple[int, str, str]) -> None:
-        """Lays texts over the picture: corner (`mujoco.mjtGridPos`), left and right column."""
+        """Overlays texts: corner (`mujoco.mjtGridPos`), left column, right column."""
         if self.is_open:
             big = mujoco.mjtFontScale.mjFONTSCALE_150
             self._viewer.set_texts([(big, *text) for text in texts])
 
     @property
     def is_open(self) -> bool:
-        """Whether nobody has closed it."""
+        """Whether the window is still open."""
         return self._viewer.is_running()
 
     def close(self) -> None:
@@ -204,15 +211,19 @@ class Window:
 
 
 def frame_stride(config: Config) -> int:
-    """Physics steps from one picture to the next, at about `FPS`."""
+    """Physics steps per picture, for about `FPS` pictures a second."""
     return max(1, round(1 / (FPS * config.task.sim_dt)))
 
 
 def _check_display() -> None:
-    """Tries a window: MuJoCo's viewer opens its own in a thread, and hangs where it cannot."""
+    """Opens and closes a hidden window: without a display, MuJoCo's viewer hangs.
+
+    Raises:
+      RenderError: if there is no display.
+    """
     import glfw
 
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         window = None
         if glfw.init():
@@ -220,40 +231,39 @@ def _check_display() -> None:
             window = glfw.create_window(64, 64, "mjx_balance", None, None)
             glfw.default_window_hints()
     if not window:
-        reason = str(said[-1].message) if said else "unknown reason"
+        reason = str(caught[-1].message) if caught else "unknown reason"
         raise RenderError(f"no window can be opened here ({reason})")
     glfw.destroy_window(window)
 
 
 def _backends() -> tuple[str, ...]:
-    """What to draw with, the first that works: what the user chose, and nothing else."""
+    """Backends to try in turn; only the user's choice if there is one."""
     chosen = os.environ.get("MUJOCO_GL")
     return (chosen,) if chosen else BACKENDS if platform.system() == "Linux" else ("",)
 
 
 def _environments() -> Iterator[dict[str, str]]:
-    """The variables of the child process for each of them."""
+    """Environment variables of the child process, for each backend."""
     for backend in _backends():
         yield os.environ | ({"MUJOCO_GL": backend} if backend else {})
 
 
-def _failed(said: str) -> RenderError:
-    """What the last backend's process said, in a sentence."""
+def _render_error(stderr: str) -> RenderError:
     return RenderError(
-        f"offscreen rendering with {' or '.join(_backends())} failed ({_last_line(said)}); on "
+        f"offscreen rendering with {' or '.join(_backends())} failed ({_last_line(stderr)}); on "
         "Debian, install libegl1 or libosmesa6"
     )
 
 
-def _last_line(said: str) -> str:
-    return (said.strip().splitlines() or ["unknown reason"])[-1]
+def _last_line(stderr: str) -> str:
+    return (stderr.strip().splitlines() or ["unknown reason"])[-1]
 
 
 @contextlib.contextmanager
-def _drawing(
+def _draw_fn(
     header: dict[str, Any], size: tuple[int, int]
 ) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
-    """A function from states (nq,) to pictures (height, width, 3), in the child process."""
+    """In the child process: a function from states (nq,) to pictures (height, width, 3)."""
     width, height = size
     model = build_model(from_dict(Config, header["config"]), visual=True)
     data = mujoco.MjData(model)
@@ -269,30 +279,30 @@ def _drawing(
 
 
 def _serve() -> None:
-    """The child process: draws what `Painter` asks for, until nothing more can come."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who watches
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # so that no library's word is a picture
-    questions = sys.stdin.buffer
-    header = json.loads(questions.readline())
-    with _drawing(header, VIDEO_SIZE) as draw:
-        answers.write(b"+")
-        answers.flush()
+    """In the child process: draws the states that `Painter` sends, until it closes the pipe."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    pictures = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keeps prints of libraries out of the pipe
+    states = sys.stdin.buffer
+    header = json.loads(states.readline())
+    with _draw_fn(header, VIDEO_SIZE) as draw:
+        pictures.write(b"+")
+        pictures.flush()
         size = 8 * build_model(from_dict(Config, header["config"])).nq
-        while len(state := questions.read(size)) == size:
-            answers.write(draw(np.frombuffer(state)).tobytes())
-            answers.flush()
+        while len(state := states.read(size)) == size:
+            pictures.write(draw(np.frombuffer(state)).tobytes())
+            pictures.flush()
 
 
 def _draw(job: Path) -> None:
-    """The child process: draws what `write` saved."""
+    """In the child process: draws the states that `write` saved."""
     import imageio.v2 as imageio
 
     with np.load(job) as saved:
         qpos, header = saved["qpos"], json.loads(str(saved["header"]))
     path = Path(header["path"])
     picture = path.suffix == ".png"
-    with _drawing(header, PICTURE_SIZE if picture else VIDEO_SIZE) as draw:
+    with _draw_fn(header, PICTURE_SIZE if picture else VIDEO_SIZE) as draw:
         try:
             if picture:
                 imageio.imwrite(path, draw(qpos[0]))
@@ -300,9 +310,9 @@ def _draw(job: Path) -> None:
             with imageio.get_writer(path, fps=header["fps"], quality=8) as writer:
                 for state in qpos:
                     writer.append_data(draw(state))
-        except OSError as error:  # of the disk: OpenGL's are others
+        except OSError as error:  # a full disk, say; OpenGL raises other errors
             print(error.strerror or error, file=sys.stderr)
-            sys.exit(UNWRITTEN)
+            sys.exit(WRITE_FAILED)
 
 
 if __name__ == "__main__":

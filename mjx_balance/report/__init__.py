@@ -1,1 +1,1 @@
-"""What a person reads of a run: tables in a terminal, figures, and a page about it. No JAX."""
+"""Output for people: tables, progress, figures and an HTML page. No JAX."""

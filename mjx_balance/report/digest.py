@@ -1,4 +1,4 @@
-"""Digest of the code that decides a result, so that a kept one is known to be out of date."""
+"""Digest of the code that decides a result: a saved result of other code is out of date."""
 
 import hashlib
 from pathlib import Path
@@ -10,9 +10,9 @@ from mjx_balance.files.sources import PACKAGE, code
 
 
 def code_digest(package: Path = PACKAGE) -> str:
-    """Digest of the evaluation, which imports the controllers, and whatever else it imports.
+    """Digest of MuJoCo's version and of the evaluation's code, with all that it imports.
 
-    MuJoCo's version counts, too; comments and docstrings decide nothing.
+    Comments and docstrings do not count.
 
     Args:
       package: folder of mjx_balance.
@@ -20,6 +20,6 @@ def code_digest(package: Path = PACKAGE) -> str:
     Returns:
       16 hexadecimal digits.
     """
-    found = code(evaluation.__name__, package)
-    parts = [mujoco.__version__, *(f"{name}:{text}" for name, text in sorted(found.items()))]
+    sources = code(evaluation.__name__, package)
+    parts = [mujoco.__version__, *(f"{name}:{text}" for name, text in sorted(sources.items()))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

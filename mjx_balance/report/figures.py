@@ -1,4 +1,4 @@
-"""Figures of what was measured; nothing here simulates."""
+"""Figures of metrics and rollouts. Nothing here simulates."""
 
 import functools
 import io
@@ -34,20 +34,19 @@ STYLE: dict[Any, Any] = {
     "axes.titlelocation": "left",
 }
 
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Lets a function draw in the package's style, whatever its caller's is."""
+def package_style(draw: Callable[P, R]) -> Callable[P, R]:
+    """Decorates a function so that it draws in the package's style, whatever the caller's."""
 
     @functools.wraps(draw)
-    def drawn(*args: P.args, **kwargs: P.kwargs) -> R:
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         with plt.rc_context(STYLE):
             return draw(*args, **kwargs)
 
-    return drawn
+    return wrapper
 
 
 def draw_figures(
@@ -60,9 +59,9 @@ def draw_figures(
     """Draws a run's figures.
 
     Args:
-      folder: to write them to; made if it is missing.
+      folder: to write them to; created if it does not exist.
       metrics: the lines of metrics.jsonl.
-      task: gives the reward.
+      task: defines the reward.
       scene: of the rollouts.
       rollouts: see `rollout_figure`.
 
@@ -70,19 +69,19 @@ def draw_figures(
       The files written.
     """
     folder.mkdir(exist_ok=True)
-    drawn = {
+    drawings = {
         "learning_curves.png": learning_curves([metrics]),
         "reward.png": reward_figure(task),
         "rollout.png": rollout_figure(scene, rollouts),
     }
-    for name, figure in drawn.items():
+    for name, figure in drawings.items():
         write_atomically(folder / name, png(figure))
-    return [folder / name for name in drawn]
+    return [folder / name for name in drawings]
 
 
-@styled
+@package_style
 def png(figure: plt.Figure) -> bytes:
-    """A figure as the contents of a PNG file; the figure is closed."""
+    """Returns the bytes of a PNG file of the figure, and closes the figure."""
     buffer = io.BytesIO()
     figure.savefig(buffer, bbox_inches="tight")
     plt.close(figure)
@@ -99,18 +98,18 @@ CURVES = (
 )
 """Metric, title and scale of each panel of the learning curves."""
 HELD_OUT = {f"eval/{suite}/tilt_mean": f"held out, {suite}" for suite in HEADLINE}
-"""Metrics of the validations that are points beside the tilt in training, and their labels."""
+"""Validation metrics that the tilt panel shows as points, and their labels."""
 
 
-@styled
+@package_style
 def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
-    """Tilt, falls, reward, loss, epsilon and speed over the decisions.
+    """Tilt, falls, reward, loss, epsilon and speed over env steps.
 
-    A point beside the tilt is one validation of one seed, where there were any.
+    A line shows the median over runs and seeds, a band the extremes. Each point in the tilt panel
+    is one validation of one seed.
 
     Args:
-      runs: the lines of metrics.jsonl of each run. Where a line has values per seed, or
-        there are several runs, a line shows the median and a band the extremes.
+      runs: the lines of metrics.jsonl of each run.
     """
     figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
     longest = max(runs, key=lambda run: run[-1]["env_steps"])
@@ -124,9 +123,9 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
             ]
         )
         if scale == "log":
-            values = np.where(values > 0, values, np.nan)  # no update yet, no loss
-        shown = np.isfinite(values).any(axis=0)
-        at, values = steps[shown] / 1000, values[:, shown]
+            values = np.where(values > 0, values, np.nan)  # a log scale has no zero
+        finite = np.isfinite(values).any(axis=0)
+        at, values = steps[finite] / 1000, values[:, finite]
         if len(values) > 1:
             low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
             axis.fill_between(at, low, high, color=BLUE, alpha=0.2, lw=0)
@@ -146,7 +145,6 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
 
 
 def _draw_held_out(axis: plt.Axes, runs: list[list[dict[str, Any]]]) -> None:
-    """Draws the validations of every run and seed as points; none if there are none."""
     for (name, label), colour in zip(HELD_OUT.items(), (ORANGE, GREY), strict=True):
         points = [
             (line["env_steps"] / 1000, value)
@@ -161,16 +159,16 @@ def _draw_held_out(axis: plt.Axes, runs: list[list[dict[str, Any]]]) -> None:
 
 
 def _seed_curves(run: list[dict[str, Any]], name: str) -> np.ndarray:
-    """One curve per seed where a run has them, else one; NaN where there was nothing to log."""
+    """(seeds, lines) values of a metric; one row if the run logs no seeds, NaN for a gap."""
     short = name.removeprefix("train/")
     if run and short in run[0].get("seeds", {}):
         return np.asarray([m["seeds"][short] for m in run], float).T
     return np.asarray([[m.get(name) for m in run]], float)
 
 
-@styled
+@package_style
 def reward_figure(task: TaskConfig) -> plt.Figure:
-    """The paper's Fig. 4, the reward for the tilt, beside our reading of its Fig. 5."""
+    """The reward for the tilt (paper Fig. 4) and for its change (our reading of Fig. 5)."""
     tilt = np.linspace(0, task.fail_tilt, 301)
     change = np.linspace(-2, 2, 301)
     none = np.zeros_like(tilt)
@@ -187,13 +185,13 @@ def reward_figure(task: TaskConfig) -> plt.Figure:
     return figure
 
 
-@styled
+@package_style
 def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
     """The paper's Fig. 7: board and body angles over time in plain MuJoCo.
 
     Args:
       scene: of the rollouts.
-      rollouts: name -> the recorded rollout of one scenario, drawn side by side.
+      rollouts: name -> rollout of one scenario with `qpos`; one column each.
     """
     figure, axes = plt.subplots(
         4,
@@ -220,7 +218,6 @@ def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
 
 
 def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
-    """Board X, board Y, body roll and body pitch on four axes."""
     assert rollout.qpos is not None, "the rollout is not recorded"
     task, qpos = rollout.task, rollout.qpos[0]
     time = np.arange(1, len(qpos) + 1) * task.sim_dt
@@ -235,13 +232,13 @@ def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
             axis.axvline(change, color="black", lw=0.8, ls=":")
 
 
-@styled
+@package_style
 def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figure:
-    """How often the body is tilted further than so much.
+    """Share of the time in which the body tilt exceeds a value, over that value.
 
     Args:
       shares: name -> (len(edges) - 1,) share of the physics steps per bin of tilt.
-      edges: deg.
+      edges: (bins + 1,) bounds of the bins, deg.
     """
     figure, axis = plt.subplots(figsize=(9, 3.8), layout="constrained")
     for k, (name, share) in enumerate(shares.items()):
@@ -258,7 +255,7 @@ def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figu
     return figure
 
 
-@styled
+@package_style
 def envelope_figure(envelope: Envelope, limit: float) -> plt.Figure:
     """Fall rate and mean tilt over incline and board speed, with the physical limits.
 

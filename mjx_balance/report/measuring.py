@@ -1,4 +1,4 @@
-"""Policy and baselines on scenarios: everything that a report has to simulate."""
+"""Simulations that a report needs: policy and baselines on the same scenarios."""
 
 import contextlib
 import dataclasses
@@ -26,12 +26,7 @@ from mjx_balance.files.run_folder import read_json
 from mjx_balance.files.validation import parse
 from mjx_balance.policy.file import Policy
 from mjx_balance.report.digest import code_digest
-from mjx_balance.report.reading import (
-    FOREIGN,
-    Finite,
-    ReportError,
-    suite_result,
-)
+from mjx_balance.report.reading import FOREIGN, Finite, ReportError, suite_result
 from mjx_balance.sim.scene import Scene
 
 DURATION = 60.0
@@ -46,8 +41,8 @@ _Shares = dict[str, dict[str, Annotated[list[Finite], Len(BINS, BINS)]]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
-    """A policy beside the baselines, on the same scenarios."""
+class Measurements:
+    """Results of a policy and of the baselines on the same scenarios."""
 
     results: dict[str, dict[str, dict[str, Any]]]
     """Controller -> suite -> `reading.suite_result`."""
@@ -58,63 +53,74 @@ class Measured:
 
 
 def edges(fail_tilt: float) -> np.ndarray:
-    """(BINS + 1,) bounds of the tilt distribution, deg; a fall's tilt has the last bin."""
+    """(BINS + 1,) bounds of the tilt bins, deg. The last bin holds the steps after a fall."""
     return np.concatenate(([0.0], np.geomspace(0.01, fail_tilt, BINS - 1), [fail_tilt + 1e-4]))
 
 
-def measured(
+def load_or_measure(
     policy: Policy, scene: Scene, file: Path, scenarios: int, progress: Callable[[str], Any]
-) -> Measured:
-    """Policy and baselines on the same scenarios; read back if it was done before.
+) -> Measurements:
+    """Measures policy and baselines, or reads an earlier result of the same measurement.
 
     Args:
-      policy: called `policy` in what is returned.
+      policy: has the name `policy` in the results.
       scene: the policy's.
-      file: what was measured before, and where it is kept.
+      file: JSON file that stores the result; missing, damaged or outdated ones are replaced.
       scenarios: per suite and controller.
       progress: title -> context manager that gives a callable taking the share done.
     """
     key = [policy.fingerprint, to_dict(policy.config), scene.hash, code_digest()]
     key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
-    with contextlib.suppress(*FOREIGN):  # whatever else lies there, it is measured again
+    with contextlib.suppress(*FOREIGN):  # an unusable file is replaced
         saved = read_json(file)
         if saved["key"] == key:
-            return kept(saved)
-    found = _measure(policy, scene, scenarios, progress)
-    with contextlib.suppress(OSError):  # a folder that cannot be written keeps nothing
-        file.write_text(json.dumps({"key": key, **dataclasses.asdict(found)}) + "\n")
-    return found
+            return parse_measurements(saved)
+    result = _measure(policy, scene, scenarios, progress)
+    with contextlib.suppress(OSError):  # a read-only folder stores nothing
+        file.write_text(json.dumps({"key": key, **dataclasses.asdict(result)}) + "\n")
+    return result
 
 
-def kept(saved: dict[str, Any]) -> Measured:
-    """Checks what was read back, value by value.
+def parse_measurements(saved: dict[str, Any]) -> Measurements:
+    """Checks a stored result, value by value.
+
+    Args:
+      saved: JSON of `Measurements`; other keys are ignored.
 
     Raises:
-      ReportError: for a value that was not measured.
-      KeyError: for one that is missing.
+      ReportError: for an invalid value.
+      KeyError: for a missing one.
     """
     shares = parse(_Shares, saved["shares"], ReportError)
-    mapped = parse(Envelope, saved["envelope"], ReportError)
-    numbers = (*mapped.inclines, *mapped.rates, mapped.authority, mapped.reach, mapped.duration_s)
-    for grid in (mapped.fall_rate, mapped.mean_tilt):
-        if np.shape(grid) != (len(mapped.inclines), len(mapped.rates)):
+    fall_map = parse(Envelope, saved["envelope"], ReportError)
+    numbers = (
+        *fall_map.inclines,
+        *fall_map.rates,
+        fall_map.authority,
+        fall_map.reach,
+        fall_map.duration_s,
+    )
+    for grid in (fall_map.fall_rate, fall_map.mean_tilt):
+        if np.shape(grid) != (len(fall_map.inclines), len(fall_map.rates)):
             raise ReportError("a grid has another shape than its inclines and rates")
-    if not np.isfinite([*numbers, *np.ravel(mapped.fall_rate), *np.ravel(mapped.mean_tilt)]).all():
+    if not np.isfinite(
+        [*numbers, *np.ravel(fall_map.fall_rate), *np.ravel(fall_map.mean_tilt)]
+    ).all():
         raise ReportError("the envelope holds values that are not finite")
     names = ("policy", *CONTROLLERS)
-    return Measured(
+    return Measurements(
         results={
             name: {suite: suite_result(saved["results"][name][suite], suite) for suite in HEADLINE}
             for name in names
         },
         shares={name: {suite: shares[name][suite] for suite in HEADLINE} for name in names},
-        envelope=mapped,
+        envelope=fall_map,
     )
 
 
 def _measure(
     policy: Policy, scene: Scene, scenarios: int, progress: Callable[[str], Any]
-) -> Measured:
+) -> Measurements:
     results: dict[str, dict[str, Any]] = {}
     shares: dict[str, dict[str, list[float]]] = {}
     for name in ("policy", *CONTROLLERS):
@@ -130,32 +136,23 @@ def _measure(
             counts, _ = np.histogram(rollout.tilt, edges(policy.config.task.fail_tilt))
             shares[name][suite] = (counts / counts.sum()).tolist()
     with progress("envelope") as bar:
-        mapped = envelope(
-            scene,
-            observing(policy),
-            ENVELOPE_SCENARIOS,
-            ENVELOPE_DURATION,
-            SEEDS.report,
-            bar,
+        fall_map = envelope(
+            scene, observing(policy), ENVELOPE_SCENARIOS, ENVELOPE_DURATION, SEEDS.report, bar
         )
-    return Measured(results, shares, mapped)
+    return Measurements(results, shares, fall_map)
 
 
-def recorded(
-    policy: Policy,
-    suite: str,
-    duration: float,
-    seed: int,
-    controller: str = "policy",
+def record_rollout(
+    policy: Policy, suite: str, duration: float, seed: int, controller: str = "policy"
 ) -> Rollout:
-    """One scenario with every state, for a figure or a video.
+    """Runs one scenario and records every state, for a figure or a video.
 
     Args:
-      policy: gives config and scene.
+      policy: defines config and scene.
       suite: kind of scenario.
-      duration: s.
-      seed: draws it.
-      controller: `policy`, or the name of a baseline that takes its place.
+      duration: of the scenario, s.
+      seed: of the scenario.
+      controller: `policy`, or the name of a baseline to run instead.
 
     Raises:
       PolicyError: if the policy belongs to another scene.

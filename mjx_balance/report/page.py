@@ -1,4 +1,4 @@
-"""One self-contained HTML page about runs, from the template beside this file."""
+"""A self-contained HTML page about runs, from the template beside this file."""
 
 import base64
 import dataclasses
@@ -19,33 +19,33 @@ from mjx_balance.files.run_folder import RunFolder, write_atomically
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.render import drawing as render
 from mjx_balance.report import figures, measuring
-from mjx_balance.report.measuring import Measured
+from mjx_balance.report.measuring import Measurements
 from mjx_balance.report.reading import Run, read_run
 from mjx_balance.report.tables import spread
 from mjx_balance.sim.scene import Scene
 
 TEMPLATE = "page.html"
-SEES = {
+BASELINE_INPUTS = {
     "none": "stands still",
     "pd-imu": "PD on a complementary filter of the same IMU",
     "pd-attitude": "PD on the true attitude",
     "rate-oracle": "predictive, true attitude and board rate",
     "clairvoyant": "predictive, knows the board's future",
 }
-"""What each baseline knows."""
+"""What each baseline observes."""
 KINDS = {
     "paper": "targets in any direction",
     "corner": "both axes at once, the case the paper's controller cannot handle",
 }
-"""What the suites of the headline try."""
+"""What each headline suite tests."""
 
 
 class Picture(NamedTuple):
-    """A figure of the page."""
+    """A figure on the page."""
 
     title: str
     png: str
-    """The file in base64."""
+    """PNG file in base64."""
     caption: str
 
 
@@ -55,13 +55,13 @@ def write_report(
     scenarios: int,
     progress: Callable[[str], Any],
 ) -> list[str]:
-    """Writes one HTML file that needs nothing else.
+    """Writes one self-contained HTML file.
 
-    The first run that has a policy is shown beside the baselines, on scenarios of the
-    report's own; what that takes is kept in its folder (`report.json`).
+    It compares the first run that has a policy with the baselines, on scenarios of the report's
+    own seed, and saves these results in the run folder (`report.json`).
 
     Args:
-      run_dirs: run folders, whole or not.
+      run_dirs: run folders, complete or not.
       out: file to write.
       scenarios: per suite and controller.
       progress: title -> context manager that gives a callable taking the share done.
@@ -76,28 +76,28 @@ def write_report(
     missing = [sentence for run in runs for sentence in run.missing]
     policy = next((run.policy for run in runs if run.policy is not None), None)
     config = next((run.config for run in runs if run.config is not None), None)
-    shown: dict[str, Any] = {"comparison": None, "seeds": None, "pictures": [], "video": None}
+    sections: dict[str, Any] = {"comparison": None, "seeds": None, "pictures": [], "video": None}
     for run in [run for run in runs if run.policy is not None][:1]:
         try:
-            shown |= _show_policy(run, runs, scenarios, progress, missing)
+            sections |= _policy_sections(run, runs, scenarios, progress, missing)
         except (PolicyError, ConfigError) as error:
             missing.append(f"{run.path}: {error}")
     page = {
         "title": f"mjx_balance: {', '.join(run.path.name for run in runs)}",
         "missing": missing,
-        **shown,
+        **sections,
         "training": training_pictures(runs, config),
         "config": config and config_tables(config),
         "commands": commands(runs, out),
         "versions": policy and versions(policy),
     }
-    # Surrogates, as file names may hold them, have no UTF-8.
+    # A file name may hold surrogates, which UTF-8 cannot encode.
     write_atomically(out, render_page(page).encode("utf-8", "replace"))
     return missing
 
 
 def render_page(page: dict[str, Any]) -> str:
-    """Fills the template; whatever the values hold, none of it becomes HTML."""
+    """Fills the template; escapes every value."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -108,14 +108,14 @@ def render_page(page: dict[str, Any]) -> str:
     return environment.get_template(TEMPLATE).render(page)
 
 
-def _show_policy(
+def _policy_sections(
     run: Run,
     runs: Sequence[Run],
     scenarios: int,
     progress: Callable[[str], Any],
     missing: list[str],
 ) -> dict[str, Any]:
-    """Everything that is measured of a run's policy.
+    """The page's sections about a run's policy; appends to `missing` if no video can be drawn.
 
     Raises:
       PolicyError: if the policy belongs to another scene.
@@ -123,25 +123,27 @@ def _show_policy(
     policy = run.policy
     assert policy is not None
     scene = policy_scene(policy)
-    found = measuring.measured(policy, scene, RunFolder(run.path).report, scenarios, progress)
-    shown: dict[str, Any] = {
-        "comparison": comparison(policy, found),
+    measurements = measuring.load_or_measure(
+        policy, scene, RunFolder(run.path).report, scenarios, progress
+    )
+    sections: dict[str, Any] = {
+        "comparison": comparison(policy, measurements),
         "seeds": seeds_table(run, runs),
-        "pictures": policy_pictures(policy, scene, found),
+        "pictures": policy_pictures(policy, scene, measurements),
     }
     try:
-        shown["video"] = video(policy)
-        shown["video_note"] = (
+        sections["video"] = video(policy)
+        sections["video_note"] = (
             f"{measuring.VIDEO_SECONDS:g} s of suite corner in plain MuJoCo, at real speed."
         )
     except render.RenderError as error:
         missing.append(f"no video: {error}")
-    return shown
+    return sections
 
 
-def comparison(policy: Policy, found: Measured) -> dict[str, Any]:
-    """Headline figures, and the table of the policy against the baselines."""
-    task, ours = policy.config.task, found.results["policy"]
+def comparison(policy: Policy, measurements: Measurements) -> dict[str, Any]:
+    """Headline figures, and a table of the policy and the baselines."""
+    task, ours = policy.config.task, measurements.results["policy"]
     count = ours["paper"]["scenarios"]
     falls = sum(ours[suite]["falls"] for suite in HEADLINE)
     tiles = [
@@ -152,12 +154,14 @@ def comparison(policy: Policy, found: Measured) -> dict[str, Any]:
         ),
         (str(falls), f"falls in {len(HEADLINE) * count} scenarios of {measuring.DURATION:g} s"),
         (
-            f"{100 * found.envelope.fall_free_share:.0f}%",
+            f"{100 * measurements.envelope.fall_free_share:.0f}%",
             "of the feasible envelope free of falls",
         ),
     ]
-    sees = {"policy": f"this network: {policy.observation_size} inputs", **SEES}
-    rows = [(name, sees[name], _baseline_cells(suites)) for name, suites in found.results.items()]
+    sees = {"policy": f"this network: {policy.observation_size} inputs", **BASELINE_INPUTS}
+    rows = [
+        (name, sees[name], _baseline_cells(suites)) for name, suites in measurements.results.items()
+    ]
     levels = task.action_levels
     note = (
         f"Plain MuJoCo, {count} held-out scenarios of {measuring.DURATION:g} s per suite (seed "
@@ -172,7 +176,7 @@ def comparison(policy: Policy, found: Measured) -> dict[str, Any]:
 
 
 def _baseline_cells(suites: dict[str, dict[str, Any]]) -> list[str]:
-    """Falls, mean, p95 and max per suite, and what the controller does at rest."""
+    """Falls, mean, p95 and max tilt per suite, then the mean action at rest."""
     cells = []
     for suite in HEADLINE:
         cells.append(str(suites[suite]["falls"]))
@@ -181,14 +185,14 @@ def _baseline_cells(suites: dict[str, dict[str, Any]]) -> list[str]:
     return [*cells, "-" if settled is None else f"{settled:.3f}"]
 
 
-def seeds_table(shown: Run, runs: Sequence[Run]) -> dict[str, Any] | None:
-    """The training seeds of `shown` and of the runs that differ from it in the seed alone."""
+def seeds_table(run: Run, runs: Sequence[Run]) -> dict[str, Any] | None:
+    """Statistics over the training seeds of `run` and of those `runs` that differ only in seed."""
 
-    def recipe(run: Run) -> Config | None:
-        return run.config and dataclasses.replace(run.config, seed=0, num_seeds=1)
+    def recipe(any_run: Run) -> Config | None:
+        return any_run.config and dataclasses.replace(any_run.config, seed=0, num_seeds=1)
 
-    alike = [run for run in runs if run is shown or (run.config and recipe(run) == recipe(shown))]
-    each = [result for run in alike for result in run.results]
+    alike = [x for x in runs if x is run or (x.config and recipe(x) == recipe(run))]
+    each = [result for x in alike for result in x.results]
     shared = [suite for suite in HEADLINE if all(suite in result for result in each)]
     if len(each) < 2 or not shared:
         return None
@@ -202,43 +206,50 @@ def seeds_table(shown: Run, runs: Sequence[Run]) -> dict[str, Any] | None:
     return {"names": TILTS, "rows": rows}
 
 
-def policy_pictures(policy: Policy, scene: Scene, found: Measured) -> list[Picture]:
+def policy_pictures(policy: Policy, scene: Scene, measurements: Measurements) -> list[Picture]:
     """The paper's Fig. 7 for each suite, the distribution of the tilt, and the envelope."""
-    task, drawn = policy.config.task, []
+    task, pictures = policy.config.task, []
     for suite in HEADLINE:
         both = {
-            name: measuring.recorded(policy, suite, measuring.RECORD_SECONDS, SEEDS.record, name)
+            name: measuring.record_rollout(
+                policy, suite, measuring.RECORD_SECONDS, SEEDS.record, name
+            )
             for name in ("policy", "pd-imu")
         }
         caption = (
             f"The paper's Fig. 7 for suite {suite} ({KINDS[suite]}), beside the PD on the same IMU."
         )
         figure = figures.rollout_figure(scene, both)
-        drawn.append(
+        pictures.append(
             _picture(f"{measuring.RECORD_SECONDS:g} s on the board: {suite}", figure, caption)
         )
-    shares = {name: np.asarray(suites["paper"]) for name, suites in found.shares.items()}
+    shares = {name: np.asarray(suites["paper"]) for name, suites in measurements.shares.items()}
     figure = figures.tilt_figure(shares, measuring.edges(task.fail_tilt))
     caption = "Suite paper, every physics step of every scenario."
-    drawn.append(_picture("Tilt distribution", figure, caption))
-    figure = figures.envelope_figure(found.envelope, task.fail_tilt)
-    return [*drawn, _picture("Envelope", figure, envelope_caption(task, found.envelope))]
+    pictures.append(_picture("Tilt distribution", figure, caption))
+    figure = figures.envelope_figure(measurements.envelope, task.fail_tilt)
+    return [*pictures, _picture("Envelope", figure, envelope_caption(task, measurements.envelope))]
 
 
-def envelope_caption(task: TaskConfig, mapped: Envelope) -> str:
-    """What the envelope's cells and its dashed line are."""
+def envelope_caption(task: TaskConfig, envelope: Envelope) -> str:
+    """Explains the cells and the dashed line of the envelope."""
     return (
-        f"Targets on both axes at once, {mapped.scenarios} scenarios of {mapped.duration_s:g} s "
-        "per cell. Right of or above the dashed line the action set cannot follow: "
+        f"Targets on both axes at once, {envelope.scenarios} scenarios of "
+        f"{envelope.duration_s:g} s per cell. Right of or above the dashed "
+        "line the action set cannot follow: "
         f"{1000 * task.action_max:g} mm {1 / task.ctrl_dt:g} times a second turn the body at "
-        f"{mapped.authority:.2f} deg/s in pitch, and the legs reach {mapped.reach:.1f} deg. "
-        f"Inside, {100 * mapped.fall_free_share:.0f}% of the cells are free of falls."
+        f"{envelope.authority:.2f} deg/s in pitch, and the legs reach {envelope.reach:.1f} deg. "
+        f"Inside, {100 * envelope.fall_free_share:.0f}% of the cells are free of falls."
     )
 
 
 def video(policy: Policy) -> str:
-    """A recorded scenario as MP4 in base64; raises `RenderError` where none can be drawn."""
-    rollout = measuring.recorded(policy, "corner", measuring.VIDEO_SECONDS, SEEDS.report)
+    """MP4 of a scenario of suite corner, in base64.
+
+    Raises:
+      RenderError: if no OpenGL backend works here.
+    """
+    rollout = measuring.record_rollout(policy, "corner", measuring.VIDEO_SECONDS, SEEDS.report)
     assert rollout.qpos is not None
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "video.mp4"
@@ -247,8 +258,8 @@ def video(policy: Policy) -> str:
 
 
 def training_pictures(runs: Sequence[Run], config: Config | None) -> list[Picture]:
-    """Learning curves, and the reward that was learnt from."""
-    drawn = []
+    """Learning curves and the reward function."""
+    pictures = []
     curves = [run.metrics for run in runs if run.metrics]
     if curves:
         caption = (
@@ -256,14 +267,14 @@ def training_pictures(runs: Sequence[Run], config: Config | None) -> list[Pictur
             "falls and reward are those of the exploring policy. Points, where there are any: the "
             "greedy policy of a seed on held-out boards in plain MuJoCo."
         )
-        drawn.append(_picture("Learning curves", figures.learning_curves(curves), caption))
+        pictures.append(_picture("Learning curves", figures.learning_curves(curves), caption))
     if config is not None:
         end = config.task.reward_tilt == "end"
         where = "at the decision's end" if end else "averaged over it"
         caption = f"The reward of one decision; the tilt is taken {where}."
         figure = figures.reward_figure(config.task)
-        drawn.append(_picture("Reward (Fig. 4 and 5 of the paper)", figure, caption))
-    return drawn
+        pictures.append(_picture("Reward (Fig. 4 and 5 of the paper)", figure, caption))
+    return pictures
 
 
 def _picture(title: str, figure: figures.plt.Figure, caption: str) -> Picture:
@@ -271,7 +282,7 @@ def _picture(title: str, figure: figures.plt.Figure, caption: str) -> Picture:
 
 
 def config_tables(config: Config) -> dict[str, Any]:
-    """What differs from the paper's preset, and everything."""
+    """The fields that differ from preset `paper`, and the whole config as JSON."""
     papers = flatten(to_dict(preset("paper")))
     differs = [
         (name, papers[name], value)
@@ -282,7 +293,7 @@ def config_tables(config: Config) -> dict[str, Any]:
 
 
 def commands(runs: Sequence[Run], out: Path) -> list[str]:
-    """Command lines that train, evaluate and report again."""
+    """Command lines that reproduce training, evaluation and report."""
     lines = [train_command(run.config) for run in runs if run.config is not None]
     for run in runs:
         if run.policy is not None:
@@ -292,22 +303,22 @@ def commands(runs: Sequence[Run], out: Path) -> list[str]:
 
 def train_command(config: Config) -> str:
     """The command that trains with this config."""
-    theirs = flatten(to_dict(preset(config.preset)))
+    defaults = flatten(to_dict(preset(config.preset)))
     words = [f"mjx-balance train --preset {config.preset} --seed {config.seed}"]
     for name, value in flatten(to_dict(config)).items():
-        if value == theirs[name] or name == "seed":
+        if value == defaults[name] or name == "seed":
             continue
         flag = name.replace("_", "-")
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
         else:
-            some = value if isinstance(value, list) else [value]
-            words.append(" ".join([f"--{flag}", *map(str, some)]))
+            values = value if isinstance(value, list) else [value]
+            words.append(" ".join([f"--{flag}", *map(str, values)]))
     return " ".join(words)
 
 
 def versions(policy: Policy) -> str:
-    """What the policy was trained with, as far as its manifest tells."""
+    """Library versions of the training; empty if the manifest has none."""
     known = policy.manifest.get("versions")
-    some = known.items() if isinstance(known, dict) else ()
-    return ", ".join(f"{name} {version}" for name, version in some if version)
+    items = known.items() if isinstance(known, dict) else ()
+    return ", ".join(f"{name} {version}" for name, version in items if version)

@@ -1,4 +1,4 @@
-"""What a person watching a run sees: a live panel in a terminal, plain lines elsewhere."""
+"""Progress of a run: a live panel in a terminal, plain lines elsewhere."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -24,7 +24,7 @@ from mjx_balance.evaluation.suites import HEADLINE
 PLAIN_INTERVAL = 5.0
 """Seconds between two plain lines."""
 
-SHOWN = {
+METRICS = {
     "perf/env_steps_per_second": ("decisions/s", "{:,.0f}"),
     "train/tilt_deg": ("mean tilt", "{:.3f} deg"),
     "train/falls_per_minute": ("falls per robot-minute", "{:.3f}"),
@@ -32,18 +32,18 @@ SHOWN = {
     "train/loss": ("loss", "{:.5f}"),
     "train/epsilon": ("epsilon", "{:.3f}"),
 }
-WARNED = {
+WARNINGS = {
     "train/diverged": ("diverged envs", "{:,.0f}"),
     "train/skipped_updates": ("skipped updates", "{:.1%}"),
 }
-"""Shown only where there are any."""
+"""Displayed only if greater than 0."""
 
 
 class Display:
     """Progress of one run on a console."""
 
     def __init__(self, console: Console | None = None):
-        """Writes to `console`, standard output if none."""
+        """Writes to `console`; to standard output if None."""
         self.console = console or Console()
         self._metrics: Mapping[str, float] = {}
         self._progress: Progress | None = None
@@ -55,7 +55,7 @@ class Display:
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Shows a step of unknown length, then how long it took."""
+        """Shows a phase of unknown length, then the time it took."""
         began = time.perf_counter()
         if self.console.is_terminal:
             with self.console.status(escape(name)):
@@ -67,7 +67,12 @@ class Display:
 
     @contextmanager
     def training(self, done: int, total: int) -> Iterator[None]:
-        """Shows the training; call `update` inside."""
+        """Shows the progress of training; call `update` inside.
+
+        Args:
+          done: decisions before this training begins.
+          total: decisions at its end.
+        """
         self._total, self._last = total, time.perf_counter()
         self._start, self._done_at_start = self._last, done
         if not self.console.is_terminal:
@@ -90,7 +95,7 @@ class Display:
         self._progress = None
 
     def update(self, done: int, metrics: Mapping[str, float]) -> None:
-        """Shows new numbers, and those of the last validation until there is another.
+        """Shows new metrics; keeps those of the last validation until the next.
 
         Args:
           done: decisions so far.
@@ -111,7 +116,7 @@ class Display:
 
     @contextmanager
     def bar(self, name: str) -> Iterator["Bar"]:
-        """A step whose share done is known."""
+        """Shows a phase; call the `Bar` with the share that is done."""
         if self.console.is_terminal:
             columns = (
                 SpinnerColumn(),
@@ -128,27 +133,26 @@ class Display:
     def _line(self) -> str:
         cells = [
             f"{label} {text.format(self._metrics[name])}"
-            for name, (label, text) in SHOWN.items()
+            for name, (label, text) in METRICS.items()
             if name in self._metrics
         ]
-        validated = [f"{label} {value}" for label, value in self._validated()]
-        return "  ".join([*cells, *validated, *self._warnings()])
+        validation = [f"{label} {value}" for label, value in self._validation()]
+        return "  ".join([*cells, *validation, *self._warnings()])
 
-    def _validated(self) -> list[tuple[str, str]]:
-        """Label and value of each validated suite, once there are any."""
-        found = []
+    def _validation(self) -> list[tuple[str, str]]:
+        """Label and value of each suite that has been validated."""
+        cells = []
         for suite in HEADLINE:
             tilt = self._metrics.get(f"eval/{suite}/tilt_mean")
             falls = self._metrics.get(f"eval/{suite}/falls")
             if tilt is not None and falls is not None:
-                found.append((f"held out, {suite}", f"{tilt:.3f} deg, falls {falls:g}"))
-        return found
+                cells.append((f"held out, {suite}", f"{tilt:.3f} deg, falls {falls:g}"))
+        return cells
 
     def _warnings(self) -> list[str]:
-        """What should not be, where it is."""
         return [
             f"{label} {text.format(self._metrics[name])}"
-            for name, (label, text) in WARNED.items()
+            for name, (label, text) in WARNINGS.items()
             if self._metrics.get(name, 0) > 0
         ]
 
@@ -157,23 +161,23 @@ class Display:
         for _ in range(6):
             grid.add_column()
         cells = []
-        for name, (label, text) in SHOWN.items():
+        for name, (label, text) in METRICS.items():
             value = text.format(self._metrics[name]) if name in self._metrics else "-"
             cells += [f"[dim]{label}[/dim]", f"[bold]{value}[/bold]"]
         grid.add_row(*cells[:6])
         grid.add_row(*cells[6:])
-        validated = [f"[dim]{x}[/dim]   [bold]{y}[/bold]" for x, y in self._validated()]
-        below = ["   ".join(validated)] if validated else []
+        validation = [f"[dim]{x}[/dim]   [bold]{y}[/bold]" for x, y in self._validation()]
+        below = ["   ".join(validation)] if validation else []
         below += [f"[bold red]{warning}[/bold red]" for warning in self._warnings()]
         assert self._progress is not None
         return Panel(Group(self._progress, grid, *below), title="mjx_balance", border_style="cyan")
 
 
 class Bar:
-    """Takes the share of a step that is done."""
+    """Shows the share of a phase that is done."""
 
     def __init__(self, progress: Progress | None):
-        """Shows it in `progress`, or nowhere."""
+        """Draws in `progress`; nowhere if None."""
         self._progress = progress
         self._task = progress.add_task("", total=1.0) if progress else None
 

@@ -1,6 +1,6 @@
-"""What can be read of a run folder, whole or not, damaged or foreign.
+"""Reads a run folder that may be incomplete, damaged or foreign.
 
-Every value that the report uses is checked here; nothing else of a file is read.
+Checks every value that the report uses, and ignores the rest of each file.
 """
 
 import dataclasses
@@ -20,42 +20,42 @@ from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report.figures import CURVES, HELD_OUT
 
 METRICS_BYTES = 8 * 2**20
-"""So much of metrics.jsonl is read."""
+"""Bytes of metrics.jsonl that are read; the rest is ignored."""
 LINE_BYTES = 2**18
-"""Longest line of it."""
+"""Greatest length of a line of metrics.jsonl."""
 MOST_SEEDS = 1000
 GREATEST = 1e15
-"""No number of a run is greater; up to here doubles hold whole numbers."""
+"""Bound of every number of a run; doubles represent all integers up to here."""
 FOREIGN = (
     *(ValueError, TypeError, KeyError, AttributeError),
     *(OverflowError, RecursionError, MemoryError, OSError),
 )
-"""What reading a file that a run did not write may raise."""
+"""Errors that reading a foreign file may raise."""
 
 
 class ReportError(InputError):
-    """A report that cannot be made, or a file that cannot be used; the message says why."""
+    """A report that cannot be written, or a file that cannot be used; the message says why."""
 
 
 @dataclasses.dataclass
 class Run:
-    """What could be read of a run folder."""
+    """The readable parts of a run folder."""
 
     path: Path
     missing: list[str] = dataclasses.field(default_factory=list)
-    """One sentence per part that is missing or unusable."""
+    """One sentence per missing or unusable part."""
     config: Config | None = None
     metrics: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     policy: Policy | None = None
     results: list[dict[str, dict[str, Any]]] = dataclasses.field(default_factory=list)
-    """The run's own evaluation, suite -> `suite_result`, of each of its seeds."""
+    """For each training seed its evaluation after training, suite -> `suite_result`."""
 
 
 def read_run(path: Path) -> Run:
-    """Reads what there is.
+    """Reads all usable parts of a run folder.
 
     Raises:
-      ReportError: if there is no folder, or nothing of a run in it.
+      ReportError: if the folder does not exist or holds no part of a run.
     """
     folder = RunFolder(path)
     parts = (folder.config, folder.metrics, folder.policy, folder.evaluation)
@@ -75,7 +75,7 @@ def read_run(path: Path) -> Run:
         try:
             return parse(file)
         except FOREIGN as error:
-            run.missing.append(f"{file} cannot be used: {why(error)}")
+            run.missing.append(f"{file} cannot be used: {error_text(error)}")
             return None
 
     run.config = read(folder.config, read_config)
@@ -90,8 +90,8 @@ def read_run(path: Path) -> Run:
     return run
 
 
-def why(error: BaseException) -> str:
-    """The reason that an error gives, in one short line."""
+def error_text(error: BaseException) -> str:
+    """An error's message in one short line."""
     reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
     return shorten(reason, MESSAGE) or type(error).__name__
 
@@ -103,7 +103,7 @@ Count = Annotated[int, Ge(0), Le(GREATEST)]
 
 @dataclasses.dataclass(frozen=True)
 class Tilt:
-    """Of the body over all physics steps, deg."""
+    """Statistics of the body tilt over all physics steps, deg."""
 
     __pydantic_config__ = LENIENT
 
@@ -114,7 +114,7 @@ class Tilt:
 
 @dataclasses.dataclass(frozen=True)
 class SuiteResult:
-    """What a report shows of the JSON of `evaluation.summarize`."""
+    """The fields of `rollout.summarize` that a report uses."""
 
     __pydantic_config__ = LENIENT
 
@@ -146,19 +146,23 @@ class _Line:
 
 
 def suite_results(value: Any) -> dict[str, dict[str, Any]]:
-    """Checks an evaluation: suite -> JSON of `evaluation.summarize`."""
+    """Checks an evaluation, suite -> JSON of `rollout.summarize`; see `suite_result`."""
     results = parse(dict[str, SuiteResult], value, ReportError, name="it")
     return {suite: _as_dict(result) for suite, result in results.items()}
 
 
 def suite_result(value: Any, suite: str) -> dict[str, Any]:
-    """Takes from the JSON of `evaluation.summarize` what a report shows.
+    """Checks a suite's result.
+
+    Args:
+      value: JSON of `rollout.summarize`.
+      suite: name of the suite.
 
     Returns:
       The fields of `SuiteResult`.
 
     Raises:
-      ReportError: for values that no evaluation gives.
+      ReportError: for a value that no evaluation returns.
     """
     return suite_results({suite: value})[suite]
 
@@ -177,7 +181,7 @@ def _read_seeds(file: Path) -> list[dict[str, dict[str, Any]]]:
 
 
 def _read_metrics(file: Path, missing: list[str]) -> list[dict[str, Any]]:
-    """The lines up to the first that cannot be used, as a crash leaves one."""
+    """The lines before the first unusable one, such as a crash leaves."""
     lines: list[dict[str, Any]] = []
     with file.open("rb") as opened:
         while text := opened.readline(LINE_BYTES + 1):
@@ -192,7 +196,7 @@ def _read_metrics(file: Path, missing: list[str]) -> list[dict[str, Any]]:
             except FOREIGN as error:
                 missing.append(
                     f"{file} is shown up to line {len(lines) + 1}, which cannot be used: "
-                    f"{why(error)}"
+                    f"{error_text(error)}"
                 )
                 return lines
     if not lines:
@@ -201,14 +205,14 @@ def _read_metrics(file: Path, missing: list[str]) -> list[dict[str, Any]]:
 
 
 def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
-    """What the learning curves need of a line that follows those `before` it."""
+    """The values of a line that learning curves use; `before` holds the earlier lines."""
     if len(text) > LINE_BYTES:
         raise ReportError(f"it is longer than {LINE_BYTES:,} bytes")
     values = parse_json(text)
     seeds = values.get("seeds", {}) if isinstance(values, dict) else None
     if not isinstance(seeds, dict):
         raise ReportError(f"it is {quote(values)}; it must map metrics to values")
-    values.setdefault("train/loss", math.nan)  # before the first update there is none
+    values.setdefault("train/loss", math.nan)  # missing before the first update
     curves = [name for name, _, _ in CURVES]
     names = (*curves, *(name for name in HELD_OUT if name in values))
     of_seeds = (*(name.removeprefix("train/") for name in curves), *HELD_OUT)
@@ -238,13 +242,13 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _counts(line: dict[str, Any]) -> dict[str, int]:
-    """Number of seeds that a line has of each metric that every line has."""
+    """Number of seeds of each training metric; validations are not in every line."""
     seeds = line.get("seeds", {})
     return {name: len(values) for name, values in seeds.items() if name not in HELD_OUT}
 
 
 def _is_gap(value: Any) -> bool:
-    """Whether a training diverged here."""
+    """Whether a value is NaN or infinite, as after a divergence."""
     return isinstance(value, float) and not math.isfinite(value)
 
 

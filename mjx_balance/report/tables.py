@@ -11,35 +11,36 @@ from rich.table import Table
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder
 
-SHOWN = ("mean", "p50", "p95", "p99", "max")
-"""Tilt statistics of an evaluation that its table shows."""
+STATISTICS = ("mean", "p50", "p95", "p99", "max")
+"""Tilt statistics in the table of an evaluation."""
 
 
 def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
     """One row per suite.
 
     Args:
-      results: suite -> JSON of `evaluation.summarize`.
+      results: suite -> JSON of `rollout.summarize`.
     """
     table = _suites_table("plain MuJoCo, tilt in deg over every physics step")
-    for name in ("scenarios", "falls", *SHOWN, "act mm"):
+    for name in ("scenarios", "falls", *STATISTICS, "act mm"):
         table.add_column(name, justify="right", no_wrap=True)
     for suite, result in results.items():
         table.add_row(
             suite,
             f"{result['scenarios']} x {result['duration_s']:g} s",
             str(result["falls"]),
-            *(f"{result['tilt_deg'][name]:.3f}" for name in SHOWN),
+            *(f"{result['tilt_deg'][name]:.3f}" for name in STATISTICS),
             f"{result['action_mm_mean']:.3f}",
         )
     return table
 
 
 def sweep_table(ranked: list[dict[str, Any]]) -> Table:
-    """One row per combination of swept values, in their order.
+    """One row per combination of swept values.
 
     Args:
-      ranked: `values`, name -> value, and `statistics`, suite -> `statistics.over_seeds`, of each.
+      ranked: combinations, best first, each with `values`, name -> value, and `statistics`,
+        suite -> `statistics.over_seeds`.
     """
     names = list(ranked[0]["values"])
     table = _narrow("sweep, best first: falls, mean tilt in deg (95% interval over seeds)")
@@ -49,17 +50,17 @@ def sweep_table(ranked: list[dict[str, Any]]) -> Table:
     for suite in suites:
         table.add_column(suite, justify="right", no_wrap=True)
     for row in ranked:
-        found = [row["statistics"][suite] for suite in suites]
+        statistics = [row["statistics"][suite] for suite in suites]
         table.add_row(
             *(f"{row['values'][name]:g}" for name in names),
-            str(found[0]["seeds"]),
-            *(f"{x['falls']}  {spread(x['mean'])}" for x in found),
+            str(statistics[0]["seeds"]),
+            *(f"{x['falls']}  {spread(x['mean'])}" for x in statistics),
         )
     return table
 
 
 def seeds_table(summary: dict[str, dict[str, Any]]) -> Table:
-    """One row per suite, interquartile means over the training seeds.
+    """One row per suite: interquartile means over the training seeds.
 
     Args:
       summary: suite -> `statistics.over_seeds`.
@@ -81,7 +82,14 @@ def spread(value: dict[str, float]) -> str:
 def print_summary(
     console: Console, run_dir: Path, results: dict[str, dict[str, Any]], seconds: float
 ) -> None:
-    """Says how the run went and where everything is."""
+    """Prints a run's results and the paths of its files.
+
+    Args:
+      console: to print to.
+      run_dir: folder of the run.
+      results: suite -> JSON of `rollout.summarize`.
+      seconds: time that the run took.
+    """
     folder = RunFolder(run_dir)
     console.print(evaluation_table(results))
     for path, what in (
@@ -99,7 +107,6 @@ def print_summary(
 
 
 def _suites_table(title: str) -> Table:
-    """One row per suite, its name in the first column; narrow."""
     table = _narrow(title)
     table.add_column("suite", style="bold", no_wrap=True)
     return table

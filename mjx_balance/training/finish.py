@@ -125,9 +125,9 @@ def _draw(folder: RunFolder) -> None:
 
     policy = load_policy(folder.policy)
     lines = [json.loads(text) for text in folder.metrics.read_text().splitlines()]
-    shown = measuring.recorded(policy, "paper", measuring.RECORD_SECONDS, SEEDS.record)
+    rollout = measuring.record_rollout(policy, "paper", measuring.RECORD_SECONDS, SEEDS.record)
     scene = evaluation.policy_scene(policy)
-    figures.draw_figures(folder.figures, lines, policy.config.task, scene, {"policy": shown})
+    figures.draw_figures(folder.figures, lines, policy.config.task, scene, {"policy": rollout})
 
 
 def _evaluate(

@@ -467,7 +467,7 @@ def test_view_shows_the_scenario_of_a_suite_and_seed(monkeypatch: pytest.MonkeyP
     rollout = run_suite(scene, controller, "corner", 1, 0.6, 3, record=True)
     assert rollout.qpos is not None
     np.testing.assert_allclose(np.concatenate(windows[0].shown), rollout.qpos[0], atol=1e-9)
-    assert {texts[1][1] for texts in windows[0].said} == {"Enter: kick"}
+    assert {texts[1][1] for texts in windows[0].said} == {"Enter: push"}
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,9 @@
-"""A board that keys tilt, and a robot that they kick."""
+"""A board that keys tilt, and a robot that they push."""
 
 import numpy as np
 import pytest
 
-from mjx_balance.cli.viewing import DOWN, KICK_KEY, LEFT, LEVEL, RIGHT, UP, Session
+from mjx_balance.cli.viewing import DOWN, LEFT, LEVEL, PUSH_KEY, RIGHT, UP, Session
 from mjx_balance.evaluation.controllers import Controller, View, make_controller
 from mjx_balance.evaluation.rollout import run_suite
 from mjx_balance.evaluation.suites import SuiteError, make_scenarios
@@ -73,14 +73,14 @@ def test_the_caption_has_the_boards_roll_before_its_pitch(scene: Scene) -> None:
     assert tilt == f"{one.tilt:.2f} deg"
 
 
-def test_a_kick_moves_the_robot_once(scene: Scene) -> None:
+def test_a_push_moves_the_robot_once(scene: Scene) -> None:
     one, other = session(scene), session(scene)
-    one.press(KICK_KEY)
-    kicked, quiet = one.decide(), other.decide()
+    one.press(PUSH_KEY)
+    moved, quiet = one.decide(), other.decide()
     root = scene.trunk_quat[0] - 3
-    way = np.linalg.norm(kicked[1, root : root + 2] - quiet[1, root : root + 2])
+    way = np.linalg.norm(moved[1, root : root + 2] - quiet[1, root : root + 2])
     assert way == pytest.approx(0.4 * 0.008, rel=0.15), "0.4 m/s over two physics steps"
-    assert not one.kicked.any()
+    assert not one.push.any()
 
 
 def test_who_falls_is_put_back_up_on_a_level_board(scene: Scene) -> None:
@@ -98,7 +98,7 @@ def test_who_falls_is_put_back_up_on_a_level_board(scene: Scene) -> None:
 
 @pytest.mark.parametrize("suite", ["push", "payload", "noise", "latency"])
 def test_a_suite_is_shown_as_it_is_evaluated(scene: Scene, suite: str) -> None:
-    """The same states as `evaluate --suite ... --seed 3`: kicks, loads, noise and delays."""
+    """The same states as `evaluate --suite ... --seed 3`: pushes, loads, noise and delays."""
     controller: Controller = make_controller("pd-imu", scene)
     rollout = run_suite(scene, controller, suite, 1, 60.0, 3, record=True)
     assert rollout.qpos is not None
@@ -123,12 +123,12 @@ def test_a_negative_seed_is_refused(scene: Scene) -> None:
             Session(scene, make_controller("none", scene), suite, seed=-1)
 
 
-def test_a_kick_by_hand_comes_beside_those_of_a_suite(scene: Scene) -> None:
+def test_a_push_by_key_adds_to_those_of_a_suite(scene: Scene) -> None:
     one, other = session(scene, suite="push"), session(scene, suite="push")
     for _ in range(8):
         one.decide()
         other.decide()
-    one.press(KICK_KEY)
+    one.press(PUSH_KEY)
     root = scene.trunk_quat[0] - 3
     ways = [np.ptp(x[:, root : root + 2], axis=0) for x in (one.decide(), other.decide())]
     assert np.linalg.norm(ways[0]) > 4 * np.linalg.norm(ways[1])

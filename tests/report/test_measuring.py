@@ -13,7 +13,7 @@ import pytest
 from mjx_balance.evaluation.rollout import Envelope, Rollout
 from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report import measuring
-from mjx_balance.report.measuring import measured
+from mjx_balance.report.measuring import load_or_measure
 from mjx_balance.report.reading import FOREIGN
 from mjx_balance.sim.scene import Scene, load_scene
 
@@ -65,7 +65,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
 def test_everyone_is_measured_on_the_same_scenarios(
     policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
 ) -> None:
-    found = measured(policy, its_scene, tmp_path / "report.json", 5, no_bar)
+    found = load_or_measure(policy, its_scene, tmp_path / "report.json", 5, no_bar)
     *suites, mapped = calls
     assert [call[1] for call in suites] == ["paper", "corner"] * 6
     assert {call[2:] for call in suites} == {(5, 60.0, 4_000_000, False)}
@@ -88,7 +88,7 @@ def test_everyone_is_measured_on_the_same_scenarios(
 def test_shares_are_those_of_the_physics_steps_in_each_bin(
     policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
 ) -> None:
-    found = measured(policy, its_scene, tmp_path / "report.json", 2, no_bar)
+    found = load_or_measure(policy, its_scene, tmp_path / "report.json", 2, no_bar)
     edges = measuring.edges(6.0)
     assert (edges[0], edges[1], edges[-2]) == (0, 0.01, pytest.approx(6))
     share = found.shares["policy"]["paper"]
@@ -112,26 +112,26 @@ def test_what_was_measured_is_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = tmp_path / "report.json"
-    first = measured(policy, its_scene, file, 5, no_bar)
+    first = load_or_measure(policy, its_scene, file, 5, no_bar)
     count = len(calls)
-    assert measured(policy, its_scene, file, 5, no_bar) == first
+    assert load_or_measure(policy, its_scene, file, 5, no_bar) == first
     assert len(calls) == count, "nothing was measured again"
-    measured(policy, its_scene, file, 6, no_bar)
+    load_or_measure(policy, its_scene, file, 6, no_bar)
     assert len(calls) == 2 * count, "another number of scenarios"
     monkeypatch.setattr(measuring, "DURATION", 61.0)
-    measured(policy, its_scene, file, 6, no_bar)
+    load_or_measure(policy, its_scene, file, 6, no_bar)
     assert len(calls) == 3 * count, "another duration"
     other = Policy(policy.manifest, weights_of(SHIPPED, by=1.001))
-    measured(other, its_scene, file, 6, no_bar)
+    load_or_measure(other, its_scene, file, 6, no_bar)
     assert len(calls) == 4 * count, "another network"
     task = dataclasses.replace(policy.config.task, action_ramp=0.3)
     other.config = dataclasses.replace(policy.config, task=task)
-    measured(other, its_scene, file, 6, no_bar)
+    load_or_measure(other, its_scene, file, 6, no_bar)
     assert len(calls) == 5 * count, "the same network in another task"
     monkeypatch.setattr(measuring, "ENVELOPE_SCENARIOS", 3)
-    measured(other, its_scene, file, 6, no_bar)
+    load_or_measure(other, its_scene, file, 6, no_bar)
     monkeypatch.setattr(measuring, "ENVELOPE_DURATION", 31.0)
-    measured(other, its_scene, file, 6, no_bar)
+    load_or_measure(other, its_scene, file, 6, no_bar)
     assert len(calls) == 7 * count, "another envelope"
 
 
@@ -166,9 +166,9 @@ def test_what_was_not_measured_is_refused(
     policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path, where: tuple
 ) -> None:
     file = tmp_path / "report.json"
-    first = measured(policy, its_scene, file, 5, no_bar)
+    first = load_or_measure(policy, its_scene, file, 5, no_bar)
     saved = json.loads(file.read_text())
-    assert measuring.kept(saved) == first
+    assert measuring.parse_measurements(saved) == first
     inside = saved
     for name in where[:-1]:
         inside = inside[name]
@@ -177,11 +177,11 @@ def test_what_was_not_measured_is_refused(
             continue  # a robot that always fell
         inside[where[-1]] = bad
         with pytest.raises(FOREIGN):
-            measuring.kept(saved)
+            measuring.parse_measurements(saved)
     del inside[where[-1]]
     if where[-1] != "action_mm_settled":
         with pytest.raises(FOREIGN):
-            measuring.kept(saved)
+            measuring.parse_measurements(saved)
 
 
 @pytest.mark.slow
@@ -189,20 +189,20 @@ def test_a_damaged_file_is_measured_again(
     policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
 ) -> None:
     file = tmp_path / "report.json"
-    first = measured(policy, its_scene, file, 5, no_bar)
+    first = load_or_measure(policy, its_scene, file, 5, no_bar)
     saved = json.loads(file.read_text())
     saved["results"]["policy"]["paper"]["falls"] = HOSTILE
     for bad in (json.dumps(saved), "[" * 100_000, "{", "null"):
         file.write_text(bad)
         calls.clear()
-        assert measured(policy, its_scene, file, 5, no_bar) == first
+        assert load_or_measure(policy, its_scene, file, 5, no_bar) == first
 
 
 def test_a_folder_that_cannot_be_written_is_measured_all_the_same(
     policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
 ) -> None:
     (tmp_path / "report.json").mkdir()
-    found = measured(policy, its_scene, tmp_path / "report.json", 5, no_bar)
+    found = load_or_measure(policy, its_scene, tmp_path / "report.json", 5, no_bar)
     assert list(found.results) == list(NAMES)
 
 
@@ -214,9 +214,9 @@ def test_with_other_code_everything_is_measured_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = tmp_path / "report.json"
-    measured(policy, its_scene, file, 5, no_bar)
+    load_or_measure(policy, its_scene, file, 5, no_bar)
     monkeypatch.setattr(measuring, "code_digest", lambda: "other")
-    measured(policy, its_scene, file, 5, no_bar)
+    load_or_measure(policy, its_scene, file, 5, no_bar)
     assert len(calls) == 2 * 13
 
 
@@ -228,8 +228,8 @@ def weights_of(path: Path, by: float) -> dict[str, np.ndarray]:
 
 
 def test_one_recorded_scenario(policy: Policy, calls: list[tuple]) -> None:
-    measuring.recorded(policy, "corner", 12.0, 7)
-    measuring.recorded(policy, "paper", 100.0, 8, "pd-imu")
+    measuring.record_rollout(policy, "corner", 12.0, 7)
+    measuring.record_rollout(policy, "paper", 100.0, 8, "pd-imu")
     assert [call[1:] for call in calls] == [
         ("corner", 1, 12.0, 7, True),
         ("paper", 1, 100.0, 8, True),

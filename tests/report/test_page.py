@@ -26,7 +26,7 @@ from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.policy.network import Policy
 from mjx_balance.render.drawing import RenderError
 from mjx_balance.report import figures, measuring, page, reading
-from mjx_balance.report.measuring import Measured
+from mjx_balance.report.measuring import Measurements
 from mjx_balance.report.reading import Run
 from mjx_balance.sim.scene import Scene
 
@@ -130,10 +130,10 @@ BLANK = {"comparison": None, "seeds": None, "pictures": [], "video": None, "trai
 BLANK |= {"title": "x", "missing": [], "config": None, "commands": [], "versions": None}
 
 
-def made_up(policy: Policy) -> Measured:
+def made_up(policy: Policy) -> Measurements:
     """A measurement in which every number is another one."""
     results: dict[str, Any] = {}
-    for k, name in enumerate(("policy", *page.SEES)):
+    for k, name in enumerate(("policy", *page.BASELINE_INPUTS)):
         results[name] = {}
         for n, suite in enumerate(("paper", "corner")):
             first = k + n / 2
@@ -159,7 +159,7 @@ def made_up(policy: Policy) -> Measured:
         duration_s=31.0,
         seed=0,
     )
-    return Measured(results, shares, envelope)
+    return Measurements(results, shares, envelope)
 
 
 def test_the_table_of_baselines_and_the_tiles(run: Path) -> None:
@@ -227,7 +227,7 @@ def test_the_pictures_of_a_policy_and_their_captions(
     for name in ("rollout_figure", "tilt_figure", "envelope_figure"):
         monkeypatch.setattr(figures, name, drawing(name))
     monkeypatch.setattr(figures, "png", lambda figure: figure)
-    monkeypatch.setattr(measuring, "recorded", lambda *given: given)
+    monkeypatch.setattr(measuring, "record_rollout", lambda *given: given)
     policy = load_policy(run / "policy.safetensors")
     found = made_up(policy)
     pictures = page.policy_pictures(policy, scene, found)
@@ -268,7 +268,7 @@ def test_the_video_is_of_a_scenario_that_was_measured(
         assert qpos.tolist() == [[0, 1], [2, 3], [4, 5]]
         file.write_bytes(b"film")
 
-    monkeypatch.setattr(measuring, "recorded", recorded)
+    monkeypatch.setattr(measuring, "record_rollout", recorded)
     monkeypatch.setattr(page.render, "write", write)
     policy = load_policy(run / "policy.safetensors")
     assert base64.b64decode(page.video(policy)) == b"film"
@@ -281,14 +281,14 @@ def test_the_first_run_that_has_a_policy_is_shown(
 ) -> None:
     asked: list[tuple] = []
 
-    def measured(policy: Policy, scene: Scene, *given: Any) -> Measured:
+    def measured(policy: Policy, scene: Scene, *given: Any) -> Measurements:
         asked.append(given)
         return made_up(policy)
 
     def no_video(policy: Policy) -> str:
         raise RenderError("no screen")
 
-    monkeypatch.setattr(measuring, "measured", measured)
+    monkeypatch.setattr(measuring, "load_or_measure", measured)
     monkeypatch.setattr(page, "policy_pictures", lambda *given: [])
     monkeypatch.setattr(page, "video", no_video)
     half = tmp_path / "half"
@@ -490,7 +490,7 @@ def test_a_hostile_run_folder_injects_nothing(
     monkeypatch.setattr(reading, "load_policy", lambda path: hostile)
     hostile = copy.copy(policy)
     hostile.manifest = manifest
-    monkeypatch.setattr(measuring, "measured", lambda *given: made_up(policy))
+    monkeypatch.setattr(measuring, "load_or_measure", lambda *given: made_up(policy))
     monkeypatch.setattr(page, "policy_pictures", lambda *given: [])
     monkeypatch.setattr(page, "video", lambda *given: "")
     assert main(("report", str(folder))) == 0

@@ -213,7 +213,9 @@ def test_figures_are_of_the_metrics_and_of_the_scenario_kept_for_them(
     [policy], _ = export(1.0)
     folder.metrics.write_text('{"env_steps": 1}\n{"env_steps": 2}\n')
     drawn: list[Any] = []
-    monkeypatch.setattr(measuring, "recorded", lambda policy, *given: (policy.fingerprint, *given))
+    monkeypatch.setattr(
+        measuring, "record_rollout", lambda policy, *given: (policy.fingerprint, *given)
+    )
     monkeypatch.setattr(figures, "draw_figures", lambda *given: drawn.append(given))
     monkeypatch.setattr(finish.evaluation, "policy_scene", lambda policy: policy.scene_hash)
     finish._draw(folder)
