@@ -399,8 +399,8 @@ DOCUMENTED = sorted(
     set(re.findall(r"automodule:: (\S+)", "".join(x.read_text() for x in API.glob("*.md"))))
 )
 WANTED = (
-    *("policy", "runtime", "env", "brax_training", "gym_envs", "config", "robots", "evaluation"),
-    *("dqn.dqn", "engines.engine"),
+    *("policy.file", "runtime", "config.schema", "robots.schema", "evaluation.rollout", "dqn.dqn"),
+    *("envs.balance", "envs.brax", "envs.gym", "sim.engines.engine"),
 )
 """Modules that the API pages must have."""
 
