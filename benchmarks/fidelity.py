@@ -34,15 +34,16 @@ with quiet_imports("torch", "warp"):
     from mjx_balance.envs.balance import BalanceEnv
     from mjx_balance.training import sizing
 from mjx_balance.config import Config, RandomizationConfig, preset
+from mjx_balance.envs.batch import Episodes
 from mjx_balance.evaluation.controllers import Controller, View
-from mjx_balance.evaluation.rollout import policy_scene, roll_out, summarize
-from mjx_balance.evaluation.suites import SEEDS, make_scenarios
+from mjx_balance.evaluation.rollout import policy_scene, roll_out
+from mjx_balance.evaluation.suites import SEEDS, draw_suite
+from mjx_balance.evaluation.summary import summarize
 from mjx_balance.policy.file import load_policy, save_policy
 from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.policy.network import Policy
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task.randomization import Conditions
-from mjx_balance.task.tilt import Scenario
+from mjx_balance.task.randomization import DRAWS, draw_params
 
 TILTS = ("mean", "p95", "max")
 ENGINES = ("mjx", "mujoco")
@@ -75,9 +76,7 @@ class Course(NamedTuple):
     """(decisions, n)"""
 
 
-def evaluation_course(
-    policy: Policy, scenario: Scenario, conditions: Conditions, duration: float
-) -> Course:
+def evaluation_course(policy: Policy, episodes: Episodes, duration: float) -> Course:
     """The course in the evaluation; its IMU samples lack the last decision's.
 
     Raises:
@@ -90,7 +89,7 @@ def evaluation_course(
         actions.append(policy(view.obs))
         return actions[-1]
 
-    rollout = roll_out(policy_scene(policy), act, scenario, duration, conditions=conditions)
+    rollout = roll_out(policy_scene(policy), act, episodes, duration)
     if rollout.fell.any():
         raise SystemExit("a robot fell: there is nothing to compare")
     tilt = rollout.tilt.reshape(*rollout.action_mm.shape, -1).mean(axis=-1).T
@@ -98,28 +97,29 @@ def evaluation_course(
 
 
 def env_courses(
-    policy: Policy, engine: Any, cases: list[tuple[Scenario, Conditions, np.ndarray]]
+    policy: Policy, engine: Any, cases: list[tuple[Episodes, np.ndarray]]
 ) -> list[tuple[Course, Course]]:
     """The courses in the training env, closed and open loop, for each case and its actions."""
-    # Whatever it is, randomisation makes the env take conditions, which are then given.
+    # Whatever it is, randomisation makes the env take domain parameters, which are then given.
     randomization = RandomizationConfig(payload=1.0)
     env = BalanceEnv(dataclasses.replace(policy.config, engine=engine, randomization=randomization))
-    count, sim_steps = len(cases[0][0].phase), env.config.task.sim_steps
+    count, sim_steps = len(cases[0][0].scenario.phase), env.config.task.sim_steps
     first = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), count))
     step = jax.jit(jax.vmap(env.step))
 
     def course(given: Any, actions: np.ndarray, replay: bool) -> Course:
-        state, seen = first.replace(info=first.info | given), []
+        state, seen = first.replace(pipeline_state=first.pipeline_state._replace(**given)), []
         for action in actions:
             chosen = action if replay else policy(np.asarray(state.obs))
             state = step(state, jnp.asarray(chosen))
-            imu = state.info["memory"].imu[:, -sim_steps:]
+            imu = state.pipeline_state.memory.imu[:, -sim_steps:]
             seen.append((state.metrics["tilt_deg"], imu, chosen))
         return Course(*(np.asarray(x) for x in zip(*seen, strict=True)))
 
     courses = []
-    for scenario, conditions, actions in cases:
-        given = {"scenario": scenario, "conditions": conditions}
+    nominal = draw_params(RandomizationConfig(), env.scene.robot, np.zeros((count, DRAWS)))
+    for episodes, actions in cases:
+        given = {"scenario": episodes.scenario, "params": episodes.params or nominal}
         given = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given)
         courses.append((course(given, actions, False), course(given, actions, True)))
     return courses
@@ -137,9 +137,9 @@ def engines(args: argparse.Namespace) -> None:
     duration = args.periods * policy.config.task.target_period
     cases, plain = [], []
     for suite in SUITES:
-        drawn = make_scenarios(policy.config, suite, args.scenarios, duration, SEEDS.held_out)
-        plain.append(evaluation_course(policy, *drawn, duration))
-        cases.append((*drawn, plain[-1].action))
+        drawn = draw_suite(policy.config, suite, args.scenarios, duration, SEEDS.held_out)
+        plain.append(evaluation_course(policy, drawn, duration))
+        cases.append((drawn, plain[-1].action))
     courses = {engine: env_courses(policy, engine, cases) for engine in ENGINES}
     rows: list[Row] = []
     for k, suite in enumerate(SUITES):
@@ -196,7 +196,7 @@ def contact(args: argparse.Namespace) -> None:
     policy = load_policy(args.policy)
     scene, rows = policy_scene(policy), []
     trunk = scene.trunk_quat[0] - np.asarray((3, 2))
-    drawn, _ = make_scenarios(policy.config, "corner", args.scenarios, DURATION, 0)
+    drawn = draw_suite(policy.config, "corner", args.scenarios, DURATION, 0)
     for name, settings in SETTINGS.items():
         controller = exploring(policy, 0.1)
         varied = with_settings(scene, settings)

@@ -21,14 +21,9 @@ from common import DURATION, POLICY, Row
 
 from mjx_balance.config import TaskConfig, preset
 from mjx_balance.evaluation.controllers import AttitudePD, Controller, ImuPD, make_controller
-from mjx_balance.evaluation.rollout import (
-    observing,
-    policy_scene,
-    roll_out,
-    run_suite,
-    summarize,
-)
-from mjx_balance.evaluation.suites import HEADLINE, SEEDS, SUITES, make_pushes, make_scenarios
+from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out, run_suite
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS, SUITES, draw_suite
+from mjx_balance.evaluation.summary import summarize
 from mjx_balance.policy.file import load_policy
 from mjx_balance.sim.scene import Scene, load_scene
 
@@ -92,13 +87,13 @@ def settling(task: TaskConfig, pushed: np.ndarray, calm: np.ndarray, at: np.ndar
 
 def push_row(name: str, scene: Scene, controller: Controller, scenarios: int) -> Row:
     """One controller, with pushes and without."""
-    drawing = scene.config, "push", scenarios, DURATION, SEEDS.held_out
-    (drawn, conditions), pushes = make_scenarios(*drawing), make_pushes(*drawing)
+    drawn = draw_suite(scene.config, "push", scenarios, DURATION, SEEDS.held_out)
+    assert drawn.pushes is not None
     calm, pushed = (
-        roll_out(scene, controller, drawn, DURATION, conditions=conditions, pushes=those)
-        for those in (None, pushes)
+        roll_out(scene, controller, episodes, DURATION)
+        for episodes in (drawn._replace(pushes=None), drawn)
     )
-    times = settling(scene.config.task, pushed.tilt, calm.tilt, pushes.at)
+    times = settling(scene.config.task, pushed.tilt, calm.tilt, drawn.pushes.due[0])
     half, most = np.percentile(times, (50, 95)).tolist()
     return {
         "controller": name,

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.evaluation.rollout import policy_scene
-from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.evaluation.suites import draw_suite
 from mjx_balance.policy.file import PolicyError, find_policy, load_policy
 from mjx_balance.runtime import Controller, State
 from mjx_balance.task.attitude import body_tilt
@@ -31,7 +31,7 @@ def main() -> None:
     data = mujoco.MjData(model)
     data.qpos, data.qacc_warmstart = stance.qpos, stance.qacc_warmstart
     data.sensordata[scene.imu] = stance.imu
-    boards, _ = make_scenarios(scene.config, "corner", 1, SECONDS, seed=0)
+    boards = draw_suite(scene.config, "corner", 1, SECONDS, seed=0).scenario
     controller = Controller(path, clock=lambda: data.time)
     tilts = []
     while data.time < SECONDS:

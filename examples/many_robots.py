@@ -25,10 +25,10 @@ from mjx_balance.config import Config, preset
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.machine import cores
 from mjx_balance.policy.file import Policy, load_policy, save_policy
 from mjx_balance.robots.catalogue import shipped
 from mjx_balance.robots.limits import for_robot
-from mjx_balance.sim.engines.mujoco import cores
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.training import sizing
 from mjx_balance.training.validation import exports

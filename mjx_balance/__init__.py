@@ -1,12 +1,12 @@
 """Massively parallel DQN training of a quadruped that balances on a tilting board.
 
 `BalanceEnv` needs JAX and is imported on first use, so that `load_policy` works
-where JAX is not installed. Where Gymnasium is, it knows `mjx_balance/Balance-v0`.
+where JAX is not installed. Where Gymnasium is, `mjx_balance/Balance-v0` is registered.
 """
 
 from typing import TYPE_CHECKING
 
-from mjx_balance.envs.registration import register_when_imported
+from mjx_balance.envs.registration import register
 from mjx_balance.policy.file import load_policy
 from mjx_balance.quiet import quiet_imports
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["BalanceEnv", "load_policy"]
 
-register_when_imported()
+register()
 
 
 def __getattr__(name: str) -> object:

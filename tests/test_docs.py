@@ -40,7 +40,7 @@ from mjx_balance.render import drawing as render
 from mjx_balance.report import page as report_page
 from mjx_balance.robots.catalogue import find_robot, shipped
 from mjx_balance.robots.schema import LegFile, RobotFile, parse_robot_file
-from mjx_balance.sim.engines.compiled import mujoco_engine
+from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.training import cluster, run
 
 REPO = Path(__file__).resolve().parent.parent
@@ -306,7 +306,12 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "find_cluster", lambda *where: first)
     monkeypatch.setattr(report_page, "write_report", lambda *arguments: [])
     # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
-    monkeypatch.setattr(env, "make_engine", mujoco_engine)
+    over_c = {"engine": "mujoco"}
+    monkeypatch.setattr(
+        env,
+        "make_engine",
+        lambda own, scene: make_engine(dataclasses.replace(own, **over_c), scene),
+    )
     clock = Clock()
     monkeypatch.setattr(time, "monotonic", clock.monotonic)
     monkeypatch.setattr(time, "sleep", clock.sleep)
@@ -400,7 +405,7 @@ DOCUMENTED = sorted(
 )
 WANTED = (
     *("policy.file", "runtime", "config.schema", "robots.schema", "evaluation.rollout", "dqn.dqn"),
-    *("envs.balance", "envs.brax", "envs.gym", "sim.engines.engine"),
+    *("envs.balance", "envs.brax", "envs.gym", "sim.engines.table"),
 )
 """Modules that the API pages must have."""
 

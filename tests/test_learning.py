@@ -16,9 +16,10 @@ from mjx_balance.policy.file import save_policy
 from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.policy.network import Policy
 from mjx_balance.robots.catalogue import find_robot
-from mjx_balance.sim.engines.engine import Engine, Motion, PhysicsState
+from mjx_balance.sim.engines.jax_engine import JaxEngine, PhysicsState
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.observation import observation_names
+from mjx_balance.task.step import Motion
 from mjx_balance.training.sizing import make_learner, size_to_device
 
 pytestmark = pytest.mark.slow
@@ -133,14 +134,17 @@ def test_actions_are_random_first_and_the_policys_later(run: Run) -> None:
     assert 0.5 < away[:, (away <= 3).all(axis=0)].mean() < 1.7, "a fidget of -2 to 2 levels"
 
 
-def still_engine(scene: Scene) -> Engine:
+def still_engine(_: Config, scene: Scene) -> JaxEngine:
     """Physics in which nothing moves: what tracing needs of an engine."""
 
-    def advance(state: PhysicsState, ctrl: jax.Array, _: Any) -> tuple[PhysicsState, Motion]:
+    def physics(state: PhysicsState, ctrl: jax.Array, _: Any) -> tuple[PhysicsState, Motion]:
         steps = len(ctrl)
-        return state, Motion(jnp.tile(scene.stance.imu, (steps, 1)), jnp.zeros(steps))
+        imu, angles = jnp.asarray(scene.stance.imu, jnp.float32), state.qpos[scene.leg_qpos]
+        return state, Motion(
+            jnp.tile(imu, (steps, 1)), jnp.zeros(steps), jnp.tile(angles, (steps, 1, 1))
+        )
 
-    return advance
+    return JaxEngine(scene, physics)
 
 
 @pytest.mark.parametrize(

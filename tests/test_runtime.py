@@ -35,7 +35,7 @@ from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.runtime import ACCEL_MOST, GYRO_MOST, Controller, PolicyFileError, State
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task import decision, tilt
+from mjx_balance.task import step, tilt
 from mjx_balance.task.kinematics import joint_angles
 from mjx_balance.task.observation import observation_names
 
@@ -153,8 +153,8 @@ def test_it_does_what_the_evaluation_does_step_by_step(
         told.append(targets.joints)
         return memory, targets
 
-    decision_controls = decision.controls
-    monkeypatch.setattr(decision, "controls", controls)
+    decision_controls = step.pre_step
+    monkeypatch.setattr(step, "pre_step", controls)
     made = run_suite(scene, watched, suite, count, decisions * 0.2, 7, record=True)
     assert not made.fell.any()
     assert made.qpos is not None
@@ -206,7 +206,7 @@ def other_robot(robot: Robot, bodies: Any) -> Robot:
 def test_it_is_the_tasks_decision_for_any_layout_and_legs(
     layout: str, legs: str, tmp_path: Path, config: Config, other_robot: Robot
 ) -> None:
-    """Random samples and joint angles, through `task/decision.py` and through the runtime."""
+    """Random samples and joint angles, through `task/step.py` and through the runtime."""
     head, changes = LAYOUTS[layout]
     config = with_head(config, head, body_height=0.33, **changes)
     policy = random_policy(tmp_path / "p", config)
@@ -220,15 +220,15 @@ def test_it_is_the_tasks_decision_for_any_layout_and_legs(
     level = tilt.Scenario(np.zeros((1, 2)), np.zeros(()), np.asarray(task.board_rate))
     still = np.array([0, 0, 0, 0, 0, 9.81])
     np.testing.assert_allclose(rig.standing, standing, rtol=0, atol=ANGLES_AGREE)
-    memory = decision.start(task, robot, still)
+    memory = step.initial_memory(task, robot, still)
     angles, sample = standing, still
-    obs = decision.observation(task, robot, memory, angles)
+    obs = step.observation(task, robot, memory, angles)
     actions = []
     for number in range(24):
         actions.append(int(policy(obs)))
         now = np.asarray(float(number))
         change = policy.actions[actions[-1]]
-        memory, targets = decision.controls(task, robot, memory, change, None, level, now)
+        memory, targets = step.pre_step(task, robot, memory, change, None, level, now)
         samples = still + rng.normal(0, (0.02, 0.02, 0.02, 0.2, 0.2, 0.2), (task.sim_steps, 6))
         for k in range(task.sim_steps):
             told = rig.step(angles, sample[:3], sample[3:])
@@ -236,7 +236,8 @@ def test_it_is_the_tasks_decision_for_any_layout_and_legs(
             assert rig.controller.action == actions[-1]
             angles, sample = told + rng.normal(0, 0.03, told.shape), samples[k]
         tilts = np.zeros(task.sim_steps)
-        memory, outcome = decision.outcome(task, robot, memory, samples, tilts, angles)
+        motion = step.Motion(samples, tilts, angles[None])
+        memory, outcome = step.post_step(task, robot, memory, motion)
         obs = outcome.obs
     assert rig.controller.state is State.BALANCING
     assert len(set(actions)) > 4

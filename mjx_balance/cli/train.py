@@ -12,6 +12,7 @@ from mjx_balance.errors import FAILED, INTERRUPTED, how_to_install
 from mjx_balance.policy.file import PolicyError
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.robots.limits import for_robot
+from mjx_balance.sim.engines.table import unused_modules
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +71,7 @@ def train(argv: list[str]) -> int:
     if args.resume and args.run_dir:
         return complain("--resume continues a folder in place; leave --run-dir out")
     try:
-        with quiet_imports("torch", *(["warp"] if args.config.engine != "warp" else [])):
+        with quiet_imports("torch", *unused_modules(args.config.engine)):
             import mjx_balance.training.run  # noqa: F401
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]

@@ -46,7 +46,7 @@ def view(argv: list[str]) -> int:
                 (corners.mjGRID_TOPLEFT, *session.caption()),
                 (corners.mjGRID_BOTTOMLEFT, keys, ""),
             )
-            window.play(session.decide())
+            window.play(session.step())
     finally:
         window.close()
     return 0

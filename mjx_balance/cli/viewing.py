@@ -4,12 +4,14 @@ import math
 
 import numpy as np
 
+from mjx_balance.envs.batch import BatchEnv, Episodes
 from mjx_balance.evaluation.controllers import Controller
-from mjx_balance.evaluation.rollout import Trials, suite_trials
-from mjx_balance.evaluation.suites import check_seed
+from mjx_balance.evaluation.rollout import look
+from mjx_balance.evaluation.suites import check_seed, draw_suite
 from mjx_balance.robots.limits import greatest_incline
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task import tilt
+from mjx_balance.task.actions import action_table
 from mjx_balance.task.pushes import Pushes
 
 STEP = 1.0
@@ -17,7 +19,7 @@ STEP = 1.0
 PUSH_SPEED = 0.4
 """Speed that a push gives our own robot, m/s; scaled by `size_scale` for others."""
 RIGHT, LEFT, DOWN, UP, PUSH_KEY, LEVEL = 262, 263, 264, 265, 257, 268
-"""GLFW codes of the arrow keys, Enter and Home."""
+"""GLFW's codes of the arrow keys, Enter and Home."""
 HELP = "arrows: tilt the board\nHome: level\nEnter: push"
 
 
@@ -27,7 +29,7 @@ class Session:
     def __init__(
         self, scene: Scene, controller: Controller, suite: str | None = None, seed: int = 0
     ):
-        """Stands the robot on the level board.
+        """Puts the robot on the level board.
 
         Args:
           scene: model, stance and task.
@@ -37,37 +39,37 @@ class Session:
             adds 1.
 
         Raises:
-          SuiteError: if the suite does not exist, or the seed is negative.
+          SuiteError: if there is no such suite, or the seed is negative.
         """
         check_seed(seed)
         self.scene, self.task, self.controller = scene, scene.config.task, controller
         self.suite, self.seed = suite, seed
-        self.max_angle = greatest_incline(self.task, scene.robot)
+        self.max_incline = greatest_incline(self.task, scene.robot)
         self.rng = np.random.default_rng(seed)
+        self.table = action_table(self.task)
         self.falls, self.rounds = 0, 0
         self._start()
 
     def _start(self) -> None:
         if self.suite is None:
-            self.trials = Trials(self.scene, self._keyed(np.zeros((2, 2)), 0), threads=1)
+            episodes = Episodes(self._keyed(np.zeros((2, 2)), 0))
         else:
-            long = self.task.episode_length * self.task.ctrl_dt
+            duration = self.task.episode_length * self.task.ctrl_dt
             seed = self.seed + self.rounds
-            self.trials = suite_trials(self.scene, self.suite, 1, long, seed, threads=1)
-        self.pushes = self.trials.pushes or Pushes(np.zeros((1, 0, 2)), np.zeros(0, int))
+            episodes = draw_suite(self.scene.config, self.suite, 1, duration, seed)
+        self.suite_pushes = episodes.pushes or Pushes(np.zeros((1, 0, 2)), np.zeros((1, 0), int))
+        self.env = BatchEnv(self.scene, episodes, threads=1)
+        self.obs = self.env.initial_obs
+        self.imu = np.tile(self.scene.stance.imu, (1, self.task.sim_steps, 1))
         self.target, self.board = np.zeros(2), np.zeros(2)
         self.push, self.number, self.tilt = np.zeros(2), 0, 0.0
 
     def press(self, key: int) -> None:
-        """Handles a key press.
-
-        Args:
-          key: GLFW code. The camera looks along the robot from behind its right.
-        """
+        """Takes a key, by GLFW's code: the camera looks along the robot from behind its right."""
         moves = {RIGHT: (1, 0), LEFT: (-1, 0), UP: (0, -1), DOWN: (0, 1)}
         if key in moves:
             target = self.target + STEP * np.asarray(moves[key])
-            self.target = np.clip(target, -self.max_angle, self.max_angle)
+            self.target = np.clip(target, -self.max_incline, self.max_incline)
         elif key == LEVEL:
             self.target = np.zeros(2)
         elif key == PUSH_KEY:
@@ -75,30 +77,35 @@ class Session:
             speed = PUSH_SPEED * self.scene.robot.size_scale
             self.push = speed * np.asarray((math.cos(angle), math.sin(angle)))
 
-    def decide(self) -> np.ndarray:
+    def step(self) -> np.ndarray:
         """Runs one decision; returns its states (sim_steps, nq)."""
-        if self.suite is None:
-            way = np.stack((self.board, self.target))
-            self.trials.scenarios = self._keyed(way, self.number)
+        env, now = self.env, self.number
         push, self.push = self.push, np.zeros(2)  # keys arrive from another thread
-        self.trials.pushes = Pushes(
-            np.concatenate((self.pushes.kicks, push[None, None]), axis=1),
-            np.append(self.pushes.at, self.number),
+        suite = self.suite_pushes
+        env.state = env.state._replace(
+            pushes=Pushes(
+                np.concatenate((suite.velocity, push[None, None]), axis=1),
+                np.append(suite.due, [[now]], axis=1),
+            )
         )
-        result = self.trials.decide(self.controller, self.number)
-        self.number += 1
-        now = np.asarray([[self.number * self.task.ctrl_dt]])
-        self.board = tilt.board_angle(self.task, self.trials.scenarios, now)[0, 0]
-        self.tilt = float(result.motion.tilt[0, -1])
+        if self.suite is None:
+            keyed = self._keyed(np.stack((self.board, self.target)), now)
+            env.state = env.state._replace(scenario=keyed)
+        action = self.controller(look(env, np.arange(1), now, self.obs, self.imu))
+        outcome = env.step(action if action.ndim == 2 else self.table[action])
+        self.obs, self.imu, self.number = outcome.obs, outcome.imu, now + 1
+        time = np.asarray([[self.number * self.task.ctrl_dt]])
+        self.board = tilt.board_angle(self.task, env.state.scenario, time)[0, 0]
+        self.tilt = float(outcome.tilt[0, -1])
         over = self.suite is not None and self.number >= self.task.episode_length
-        if result.down[0] or over:
-            self.falls += bool(result.down[0])
+        if outcome.terminated[0] or over:
+            self.falls += bool(outcome.terminated[0])
             self.rounds += 1
             self._start()
-        return result.motion.qpos[0]
+        return env.path[0]
 
     def _keyed(self, way: np.ndarray, number: int) -> tilt.Scenario:
-        """A board that turns from `way[0]` to `way[1]`, (2, 2) deg, from decision `number` on."""
+        """A board that turns from `way[0]` to `way[1]` (2, 2), deg, from decision `number` on."""
         phase = self.task.target_period - number * self.task.ctrl_dt
         return tilt.Scenario(way[None], np.asarray([phase]), np.asarray([self.task.board_rate]))
 

@@ -1,7 +1,7 @@
 """`BalanceEnv`: one robot on one board, a brax environment with 441 or with continuous actions."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -9,28 +9,29 @@ from brax.envs.base import Env, State
 
 from mjx_balance.config import ACTION_AXES, Config, check, preset
 from mjx_balance.envs.metrics import Metric
-from mjx_balance.sim.engines.choice import make_engine
-from mjx_balance.sim.engines.engine import Engine, settled
+from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.sim.scene import Scene, load_scene
-from mjx_balance.task import decision, tilt
+from mjx_balance.task import tilt
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.observation import input_rows
-from mjx_balance.task.pushes import Pushes, draw_kicks, kick, kicked_decisions
-from mjx_balance.task.randomization import DRAWS, draw_conditions
+from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
+from mjx_balance.task.randomization import DRAWS, draw_params
 from mjx_balance.task.reward import reward_rows
+from mjx_balance.task.step import EnvState, initial_memory, observation, step
 from mjx_balance.task.symmetry import Symmetries, symmetries
 
 
 class BalanceEnv(Env):
     """A quadruped on a board that tilts in two axes (paper section 3).
 
-    One step is one decision: `sim_steps` physics steps of the config's engine. `done` is 1 after a
-    fall or at the time limit; `info["truncation"]` is 1 only at the time limit, so
-    that `done * (1 - truncation)` marks true terminations. A done env is not reset
-    by `step`: the observation it returns is the one before the reset.
+    One step is one decision: `sim_steps` physics steps of the config's engine. `pipeline_state` is
+    the `EnvState` of `task.step`. `done` is 1 after a fall or at the time limit;
+    `info["truncation"]` is 1 only at the time limit, so that `done * (1 - truncation)` marks true
+    terminations. A done env is not reset by `step`: the observation it returns is the one before
+    the reset.
 
     Written for one board; `jax.vmap` it over thousands. For brax's own trainers:
-    `brax_training.wrap`.
+    `envs.brax.wrap`.
     """
 
     metrics: ClassVar[Mapping[str, Metric]] = {
@@ -54,11 +55,10 @@ class BalanceEnv(Env):
         self._discrete = check_action(action) == "discrete"
         self.config = check(config or preset("default"))
         self.scene: Scene = load_scene(self.config)
-        self._engine: Engine = make_engine(self.scene)
+        self.engine = make_engine(self.config, self.scene)
         self._table = action_table(self.config.task)
         ranges, task = self.config.randomization, self.config.task
-        self._randomised = ranges.varies
-        self._kicked = kicked_decisions(task, ranges, task.episode_length * task.ctrl_dt)
+        self._push_decisions = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
 
     @property
     def observation_size(self) -> int:
@@ -93,43 +93,46 @@ class BalanceEnv(Env):
         Returns:
           State with obs (obs_size,).
         """
-        task, robot = self.config.task, self.scene.robot
+        task, robot, scene = self.config.task, self.scene.robot, self.scene
         # No key depends on how many are split off: pushes change no other draw.
-        rng, key_conditions, key_noise, key_kicks = jax.random.split(rng, 4)
-        physics = settled(self.scene)
-        memory = decision.start(task, robot, jnp.asarray(self.scene.stance.imu, jnp.float32))
+        rng, key_params, key_noise, key_pushes = jax.random.split(rng, 4)
         info = {
-            "scenario": self._scenario(rng),
-            "memory": memory,
-            "decision": jnp.int32(0),
-            "decisions_left": jnp.int32(task.episode_length),
+            "episode_length": jnp.int32(task.episode_length),
             "truncation": jnp.float32(0.0),
         }
-        if self._randomised:
-            uniform = jax.random.uniform(key_conditions, (DRAWS,))
-            info |= {
-                "conditions": draw_conditions(self.config.randomization, robot, uniform),
-                "noise_key": key_noise,
-            }
-        if len(self._kicked):
-            uniform = jax.random.uniform(key_kicks, (len(self._kicked), 2))
-            info["kicks"] = draw_kicks(self.config.randomization, uniform)
-        obs = decision.observation(task, robot, memory, physics.qpos[self.scene.leg_qpos])
+        params, pushes, ranges = None, None, self.config.randomization
+        if ranges.varies:
+            params = draw_params(ranges, robot, jax.random.uniform(key_params, (DRAWS,)))
+            info["noise_key"] = key_noise
+        if len(self._push_decisions):
+            uniform = jax.random.uniform(key_pushes, (len(self._push_decisions), 2))
+            due = jnp.asarray(self._push_decisions, jnp.int32)
+            pushes = Pushes(draw_velocity(ranges, uniform), due)
+        start = EnvState(
+            physics=self.engine.initial(),
+            memory=initial_memory(task, robot, jnp.asarray(scene.stance.imu, jnp.float32)),
+            scenario=self._scenario(rng),
+            env_steps=jnp.int32(0),
+            params=params,
+            pushes=pushes,
+        )
+        angles = start.physics.qpos[scene.leg_qpos]
+        obs = observation(task, robot, start.memory, angles)
         zero = jnp.float32(0.0)
         rewards = [f"reward_{row.name}" for row in reward_rows(task)]
         metrics = dict.fromkeys(("tilt_deg", "fall", "diverged", *rewards), zero)
-        return State(physics, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
+        return State(start, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
 
     def reset_staggered(self, rng: jax.Array) -> State:
-        """`reset`, but with a random part of the episode's time limit already used.
+        """`reset`, but with a random time limit of 1 to `episode_length` decisions.
 
         For the first episodes of a batch, which would otherwise all time out together.
         """
-        key_reset, key_left = jax.random.split(rng)
+        key_reset, key_length = jax.random.split(rng)
         state = self.reset(key_reset)
-        left = jax.random.randint(key_left, (), 1, self.config.task.episode_length + 1)
+        length = jax.random.randint(key_length, (), 1, self.config.task.episode_length + 1)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            info=state.info | {"decisions_left": left}
+            info=state.info | {"episode_length": length}
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -142,48 +145,29 @@ class BalanceEnv(Env):
         Returns:
           The state `ctrl_dt` later.
         """
-        task, robot = self.config.task, self.scene.robot
-        info: dict[str, Any] = state.info
-        change = self._change(action)
-        conditions = info.get("conditions")
-        late = None if conditions is None else conditions.latency > 0
-        memory, targets = decision.controls(
-            task, robot, info["memory"], change, late, info["scenario"], info["decision"]
-        )
-        before: Any = state.pipeline_state
-        if "kicks" in info:
-            added = kick(Pushes(info["kicks"], self._kicked), info["decision"])
-            before = before._replace(qvel=before.qvel.at[self.scene.trunk_velocity].add(added))
-        with jax.named_scope("physics"):
-            moved, motion = self._engine(before, self.scene.ctrl(targets), conditions)
-        samples = motion.imu
-        if conditions is not None:
+        task, info, noise = self.config.task, state.info, None
+        if "noise_key" in info:
             key, key_noise = jax.random.split(info["noise_key"])
-            noise = jax.random.normal(key_noise, samples.shape)
-            samples = samples + conditions.imu_noise * noise
+            noise = jax.random.normal(key_noise, (task.sim_steps, 6))
             info = info | {"noise_key": key}
-        angles = moved.qpos[self.scene.leg_qpos]
-        memory, outcome = decision.outcome(task, robot, memory, samples, motion.tilt, angles)
-        truncated = ~outcome.fell & (info["decisions_left"] <= 1)
+        before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+        after, outcome = step(
+            task, self.scene.robot, self.engine, before, self._change(action), noise
+        )
+        truncated = ~outcome.terminated & (after.env_steps >= info["episode_length"])
         metrics = {
             "tilt_deg": outcome.tilt.mean(),
-            "fall": outcome.fell.astype(jnp.float32),
+            "fall": outcome.terminated.astype(jnp.float32),
             "diverged": outcome.diverged.astype(jnp.float32),
             **{f"reward_{name}": term for name, term in outcome.rewards.items()},
         }
-        info = info | {
-            "memory": memory,
-            "decision": info["decision"] + 1,
-            "decisions_left": info["decisions_left"] - 1,
-            "truncation": truncated.astype(jnp.float32),
-        }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            pipeline_state=moved,
+            pipeline_state=after,
             obs=outcome.obs,
-            reward=sum(outcome.rewards.values()),
-            done=(outcome.fell | truncated).astype(jnp.float32),
+            reward=outcome.reward,
+            done=(outcome.terminated | truncated).astype(jnp.float32),
             metrics=state.metrics | metrics,
-            info=info,
+            info=info | {"truncation": truncated.astype(jnp.float32)},
         )
 
     def _change(self, action: jax.Array) -> jax.Array:
@@ -194,13 +178,8 @@ class BalanceEnv(Env):
 
     def _scenario(self, key: jax.Array) -> tilt.Scenario:
         """Draws the targets, and the age of the first."""
-        task = self.config.task
-        count = tilt.num_targets(task, task.episode_length * task.ctrl_dt)
-        key_disc, key_square, key_which, key_phase = jax.random.split(key, 4)
+        keys = iter(jax.random.split(key, 4))
         return tilt.draw_scenario(
-            task,
-            disc=jax.random.uniform(key_disc, (2, count)),
-            square=jax.random.uniform(key_square, (count, 2), minval=-1.0),
-            which=jax.random.uniform(key_which, (count, 1)),
-            phase=jax.random.uniform(key_phase),
+            self.config.task,
+            lambda shape, low, high: jax.random.uniform(next(keys), shape, minval=low, maxval=high),
         )

@@ -1,10 +1,8 @@
 """What brax's trainers need to train `BalanceEnv`: `ppo.train(env, wrap_env_fn=wrap, ...)`.
 
-brax's own wrapping starts an episode again with its first physics and observation and leaves
-`info` alone. Physics and observation of a settled robot are the same in all of our episodes,
-but scenario, memories, circumstances and clock live in `info`: after a fall the legs would jump
-to where they fell, on a board that is already tilted, and from the time limit on every
-step would end an episode.
+brax's own wrapping starts an episode again with its first `pipeline_state` and observation and
+leaves `info` alone: every episode of an env would have the same scenario and domain parameters, and
+its sensor noise would go on with the old key.
 """
 
 from collections.abc import Sequence
@@ -43,7 +41,7 @@ def wrap(
       env: one board.
       episode_length: decisions until brax cuts an episode off; at most the env's own.
       action_repeat: decisions that take the same action.
-      randomization_fn: none; circumstances are drawn as the env's config says.
+      randomization_fn: None; domain parameters are drawn as the env's config says.
 
     Raises:
       ValueError: for a longer episode, or a randomization_fn.
@@ -67,13 +65,13 @@ class _Endless(Wrapper):
 
 
 class _NewScenarios(AutoResetWrapper):
-    """brax's automatic reset, and that of the env's own part of `info`, from a fresh key."""
+    """brax's automatic reset, but to a new episode: state and `info` from a fresh key."""
 
     def __init__(self, env: Env):
         super().__init__(env)
         key = jax.eval_shape(lambda: jax.random.PRNGKey(0))
         start = jax.eval_shape(env.unwrapped.reset, key)
-        self._own = sorted(start.info.keys() - {"truncation"})
+        self._own = sorted({*start.info.keys(), "next_key"} - {"truncation"})
 
     def reset(self, rng: jax.Array) -> State:
         """Starts episodes from keys (n, 2)."""
@@ -90,8 +88,8 @@ class _NewScenarios(AutoResetWrapper):
         def choose(new: jax.Array, old: jax.Array) -> jax.Array:
             return jnp.where(after.done.reshape(-1, *[1] * (old.ndim - 1)) > 0, new, old)
 
-        renewed = (*self._own, "next_key")
-        new, old = ({name: info[name] for name in renewed} for info in (start.info, after.info))
+        info = {name: choose(start.info[name], after.info[name]) for name in self._own}
         return after.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            info=after.info | jax.tree.map(choose, new, old)
+            pipeline_state=jax.tree.map(choose, start.pipeline_state, after.pipeline_state),
+            info=after.info | info,
         )

@@ -1,4 +1,7 @@
-"""The task as Gymnasium's envs, in plain MuJoCo: one board, or many at once. No JAX."""
+"""The task as Gymnasium's envs, in plain MuJoCo: one env, or many at once. No JAX.
+
+`import mjx_balance` registers them (`registration.py`).
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,20 +14,21 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mjx_balance.config import Config, ConfigError, TaskConfig
+from mjx_balance.config import Config, ConfigError, TaskConfig, check
 from mjx_balance.config import preset as find_preset
-from mjx_balance.envs.batch import Boards, Step
+from mjx_balance.envs.batch import BatchEnv, draw_episodes
 from mjx_balance.files.text import quote
 from mjx_balance.render.drawing import Painter, RenderError, Window
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import for_robot
+from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.actions import action_table, check_action
-from mjx_balance.task.decision import ABSURD
 from mjx_balance.task.observation import input_rows
+from mjx_balance.task.step import DIVERGED, Outcome
 
 
 class _Actions:
-    """What a board may be told, and what that means."""
+    """The action space, and what its elements do."""
 
     def __init__(self, task: TaskConfig, kind: str):
         self._most = task.action_max
@@ -39,7 +43,7 @@ class _Actions:
         """The action or actions as an array of a space that holds them.
 
         Raises:
-          InvalidAction: if it holds them not.
+          InvalidAction: if an action is outside the space.
         """
         # Of a space of several whole numbers, older versions of Gymnasium take any for one.
         kinds = "iu" if self._table is not None else "f"
@@ -60,7 +64,7 @@ class _Actions:
 
 
 def _named(action: Any, array: np.ndarray | None, single: spaces.Space) -> str:
-    """What is wrong with an action, or with the first of several that is wrong."""
+    """Names an action outside its space, or the first of several."""
     if array is not None and array.ndim == len(single.shape or ()) + 1:
         for k, own in enumerate(array):
             if not single.contains(own):
@@ -69,7 +73,7 @@ def _named(action: Any, array: np.ndarray | None, single: spaces.Space) -> str:
 
 
 def _config(preset: str | None, config: Config | None, robot: str | None) -> Config:
-    """The one that is named, made for a robot; the preset "default" if none is."""
+    """The config, or the preset fitted to the robot; "default" if neither is given."""
     for name, value in (("preset", preset), ("robot", robot)):
         if value is not None and not isinstance(value, str):
             raise ConfigError(f"{name} is {quote(value)}; it must be a name")
@@ -82,16 +86,16 @@ def _config(preset: str | None, config: Config | None, robot: str | None) -> Con
 
 
 def _check_options(options: dict[str, Any] | None) -> None:
-    """Refuses what a reset would not do, as Gymnasium's `reset_mask`: every board starts anew."""
+    """Refuses options, as Gymnasium's `reset_mask`: a reset starts every env anew."""
     if options:
         raise ValueError(f"options is {quote(options)}; it must be None or {{}}: there are none")
 
 
 def _seeds(seed: Any, count: int) -> list[int | None]:
-    """Of each board, or none.
+    """Seed of each env, or None.
 
     Raises:
-      ValueError: if there are not as many as boards.
+      ValueError: if there are not as many as envs.
     """
     if seed is None:
         return [None] * count
@@ -108,9 +112,9 @@ def _seeds(seed: Any, count: int) -> list[int | None]:
 
 
 def _observations(task: TaskConfig, robot: Robot) -> spaces.Box:
-    """All that `decision.outcome` lets through; what is larger is a diverged simulation's."""
+    """All that `task.step` lets through; larger values are a diverged simulation's."""
     scale = np.asarray([row.scale for row in input_rows(task, robot)], np.float32)
-    most = ABSURD / scale
+    most = DIVERGED / scale
     return spaces.Box(-most, most, dtype=np.float32)
 
 
@@ -155,14 +159,16 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
           UnsupportedMode: for another render mode.
         """
         _check_mode(render_mode, self.metadata["render_modes"])
-        self.boards = Boards(_config(preset, config, robot), 1, threads=1)
-        task = self.boards.config.task
+        self.config = check(_config(preset, config, robot))
+        self.scene = load_scene(self.config)
+        self.batch: BatchEnv | None = None
+        task = self.config.task
         self._actions = _Actions(task, action)
         self.action_space = self._actions.space
-        self.observation_space = _observations(task, self.boards.scene.robot)
+        self.observation_space = _observations(task, self.scene.robot)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
-        self._under_way = False
+        self._running = False
         self._window: Window | None = None
         self._painter: Painter | None = None
 
@@ -180,10 +186,14 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
         """
         _check_options(options)
         super().reset(seed=seed)
-        obs = self.boards.start(np.arange(1), [self.np_random])
-        self._under_way = True
-        self._show(self.boards.qpos[:, None])
-        return obs[0], {}
+        episodes = draw_episodes(self.config, self.scene.robot, [self.np_random])
+        if self.batch is None:
+            self.batch = BatchEnv(self.scene, episodes, threads=1)
+        else:
+            self.batch.reset(np.arange(1), episodes)
+        self._running = True
+        self._show(self.batch.qpos[:, None])
+        return self.batch.initial_obs[0].astype(np.float32), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Takes one decision.
@@ -192,15 +202,17 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
           InvalidAction: for what is not in the action space.
           ResetNeeded: before the first reset, and after the end of an episode.
         """
-        if not self._under_way:
+        if not self._running or self.batch is None:
             raise ResetNeeded("no episode is under way; call reset() before step()")
         read = self._actions.read(action, self.action_space)
-        made = self.boards.decide(self._actions.change(read[None]))
-        self._show(made.qpos)
-        fell, late = bool(made.fell[0]), bool(made.timed_out[0])
-        self._under_way = not (fell or late)
-        info = {"tilt_deg": float(made.tilt[0]), "fall": fell}
-        return made.obs[0], float(made.reward[0]), fell, late, info
+        outcome = self.batch.step(self._actions.change(read[None]))
+        self._show(self.batch.path)
+        terminated = bool(outcome.terminated[0])
+        truncated = bool(_truncated(self.batch, outcome)[0])
+        self._running = not (terminated or truncated)
+        info = {"tilt_deg": float(outcome.tilt[0].mean()), "fall": terminated}
+        obs = outcome.obs[0].astype(np.float32)
+        return obs, float(outcome.reward[0]), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """The picture (height, width, 3) of `rgb_array`; a window needs no call."""
@@ -208,14 +220,15 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
             gymnasium.logger.warn("render() gives no picture without a render_mode; choose one")
         if self.render_mode != "rgb_array":
             return None
-        self._painter = self._painter or Painter(self.boards.config)
-        return self._painter.draw(self.boards.qpos[0])
+        self._painter = self._painter or Painter(self.config)
+        qpos = self.scene.stance.qpos if self.batch is None else self.batch.qpos[0]
+        return self._painter.draw(qpos)
 
     def close(self) -> None:
         """Closes the window and ends the process that draws."""
-        for shown_by in (self._window, self._painter):
-            if shown_by is not None:
-                shown_by.close()
+        for renderer in (self._window, self._painter):
+            if renderer is not None:
+                renderer.close()
         self._window = self._painter = None
 
     def _show(self, qpos: np.ndarray) -> None:
@@ -224,17 +237,17 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
             return
         if self._window is None:
             try:
-                self._window = Window(self.boards.config)
+                self._window = Window(self.config)
             except RenderError as error:
                 raise RenderError(f"{error}; render_mode 'rgb_array' needs no display") from error
         self._window.play(qpos[0])
 
 
 class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Many boards in `mujoco.batch.Batch`, on all cores; board k does what one env would do.
+    """Many envs in `mujoco.batch.Batch`, on all cores; env k does what one alone would do.
 
-    Who falls or runs out of time starts again in the same step: its observation is the first of
-    the new episode, `final_obs` and `final_info` tell of the old one.
+    An env that terminates or is truncated is reset in the same step: its observation is the first
+    of the new episode, `final_obs` and `final_info` are of the old one.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -242,7 +255,7 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         "render_fps": 5,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
-    # Of the class: one that could not be made is closed too.
+    # Of the class: an env whose constructor failed is closed, too.
     _painter: Painter | None = None
 
     def __init__(
@@ -257,7 +270,7 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Builds the scene.
 
         Args:
-          num_envs: boards.
+          num_envs: how many.
           preset: name of the config.
           config: instead of preset and robot.
           action: "discrete" or "continuous".
@@ -272,12 +285,14 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
         if not whole or num_envs < 1:
             raise ConfigError(f"num_envs is {quote(num_envs)}; it must be a whole number above 0")
-        self.boards = Boards(_config(preset, config, robot), num_envs)
-        task = self.boards.config.task
+        self.config = check(_config(preset, config, robot))
+        self.scene = load_scene(self.config)
+        self.batch: BatchEnv | None = None
+        task = self.config.task
         self._actions = _Actions(task, action)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.single_action_space = self._actions.space
-        self.single_observation_space = _observations(task, self.boards.scene.robot)
+        self.single_observation_space = _observations(task, self.scene.robot)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
@@ -289,15 +304,15 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seed: int | Sequence[int | None] | np.ndarray | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts fresh scenarios on all boards.
+        """Starts fresh scenarios in all envs.
 
         Args:
-          seed: board k gets `seed + k`, or `seed[k]`; one that gets none goes on with its
+          seed: env k gets `seed + k`, or `seed[k]`; one that gets none goes on with its
             generator.
-          options: there are none; `reset_mask` is for envs that do not start again by themselves.
+          options: there are none; `reset_mask` is for envs that do not reset by themselves.
 
         Raises:
-          ValueError: if there are options, or not as many seeds as boards.
+          ValueError: if there are options, or not as many seeds as envs.
         """
         _check_options(options)
         seeds = _seeds(seed, self.num_envs)
@@ -306,40 +321,50 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             np_random(number)[0] if rng is None or number is not None else rng
             for number, rng in zip(seeds, old, strict=True)
         ]
-        return self.boards.start(np.arange(self.num_envs), self._rngs), {}
+        episodes = draw_episodes(self.config, self.scene.robot, self._rngs)
+        if self.batch is None:
+            self.batch = BatchEnv(self.scene, episodes)
+        else:
+            self.batch.reset(np.arange(self.num_envs), episodes)
+        return self.batch.initial_obs.astype(np.float32), {}
 
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Takes one decision on every board.
+        """Takes one decision in every env.
 
         Raises:
           InvalidAction: for what is not in the action space.
           ResetNeeded: before the first reset.
         """
-        if not self._rngs:
+        if self.batch is None:
             raise ResetNeeded("no episode is under way; call reset() before step()")
         read = self._actions.read(actions, self.action_space)
-        made = self.boards.decide(self._actions.change(read))
-        done = made.fell | made.timed_out
-        obs, info = made.obs, _info(made, ~done)
+        outcome = self.batch.step(self._actions.change(read))
+        terminated, truncated = outcome.terminated, _truncated(self.batch, outcome)
+        done = terminated | truncated
+        obs, info = outcome.obs.astype(np.float32), _info(outcome, ~done)
         if done.any():
             ids = np.flatnonzero(done)
             final = np.full(self.num_envs, None, object)
             for k in ids:
                 final[k] = obs[k].copy()
             info |= {"final_obs": final, "_final_obs": done}
-            info |= {"final_info": _info(made, done), "_final_info": done.copy()}
-            obs[ids] = self.boards.start(ids, [self._rngs[k] for k in ids])
-        return obs, made.reward, made.fell, made.timed_out, info
+            info |= {"final_info": _info(outcome, done), "_final_info": done.copy()}
+            rngs = [self._rngs[k] for k in ids]
+            self.batch.reset(ids, draw_episodes(self.config, self.scene.robot, rngs))
+            obs[ids] = self.batch.initial_obs[ids]
+        return obs, outcome.reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture (height, width, 3) of each board."""
+        """A picture (height, width, 3) of each env."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() gives no picture without a render_mode; choose one")
             return None
-        self._painter = self._painter or Painter(self.boards.config)
-        return tuple(self._painter.draw(state) for state in self.boards.qpos)
+        self._painter = self._painter or Painter(self.config)
+        stance = np.tile(self.scene.stance.qpos, (self.num_envs, 1))
+        states = stance if self.batch is None else self.batch.qpos
+        return tuple(self._painter.draw(state) for state in states)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the process that draws."""
@@ -348,11 +373,16 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore
-        """Of each board; none before the first reset."""
+        """Of each env; none before the first reset."""
         return tuple(self._rngs)
 
 
-def _info(made: Step, where: np.ndarray) -> dict[str, np.ndarray]:
-    """Tilt and fall of some boards, in Gymnasium's form: 0 elsewhere, and which they are."""
-    tilt, fall = np.where(where, made.tilt, 0.0), made.fell & where
+def _truncated(batch: BatchEnv, outcome: Outcome) -> np.ndarray:
+    """(n,) whether the time limit of a standing robot is reached."""
+    return ~outcome.terminated & (batch.state.env_steps >= batch.task.episode_length)
+
+
+def _info(outcome: Outcome, where: np.ndarray) -> dict[str, np.ndarray]:
+    """Tilt and fall of some envs, in Gymnasium's form: 0 elsewhere, and which they are."""
+    tilt, fall = np.where(where, outcome.tilt.mean(axis=-1), 0.0), outcome.terminated & where
     return {"tilt_deg": tilt, "_tilt_deg": where.copy(), "fall": fall, "_fall": where.copy()}

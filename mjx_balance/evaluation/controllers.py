@@ -1,4 +1,4 @@
-"""Who acts: what a controller sees, and classical ones to measure a policy against. No JAX.
+"""Controllers: what one sees, and classical ones to compare a policy with. No JAX.
 
 The baselines act through the policy's own action set. `pd-imu` sees what the policy
 sees. The others cheat, each with more knowledge, and bound what any controller can do
@@ -13,9 +13,10 @@ import mujoco
 import numpy as np
 
 from mjx_balance.config import ACTION_AXES
+from mjx_balance.envs.batch import BatchEnv, Episodes
 from mjx_balance.errors import InputError
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task import decision, tilt
+from mjx_balance.task import tilt
 from mjx_balance.task.actions import nearest_action
 from mjx_balance.task.attitude import roll_pitch
 
@@ -26,14 +27,14 @@ SWEEPS = 25
 
 
 class View(NamedTuple):
-    """All there is to see when n scenarios of an evaluation take a decision.
+    """What n scenarios of an evaluation show before a decision.
 
     A policy looks at `obs` alone; baselines may look at what no robot knows.
     """
 
     ids: np.ndarray
     """(n,) numbers of these scenarios in the batch, for controllers with a memory."""
-    decision: int
+    env_steps: int
     """Decisions since the start."""
     obs: np.ndarray
     """(n, obs_size) the network's input."""
@@ -45,12 +46,12 @@ class View(NamedTuple):
     """(n, nv) true velocities."""
     scenario: tilt.Scenario
     """Where the boards go."""
-    late: np.ndarray
-    """(n,) whether actions are taken one decision late."""
+    delayed: np.ndarray
+    """(n,) whether actions are taken one decision later."""
 
 
 Controller = Callable[[View], np.ndarray]
-"""Maps what there is to see of n scenarios to action indices (n,), or to a_x and a_y (n, 2), m."""
+"""Maps the view of n scenarios to action indices (n,), or to a_x and a_y (n, 2), m."""
 
 
 class ControllerError(InputError):
@@ -69,27 +70,18 @@ class Response:
 
 def measure_response(scene: Scene) -> Response:
     """Takes one action on each axis, on the level board, and watches the body."""
-    task, robot = scene.config.task, scene.robot
-    size = task.action_max / 2
-    gains, courses = [], []
-    level = tilt.Scenario(np.zeros((1, 2)), np.zeros(()), np.asarray(task.board_rate))
-    for axis in range(ACTION_AXES):
-        data = mujoco.MjData(scene.model)
-        data.qpos, data.qvel = scene.stance.qpos, scene.stance.qvel
-        memory = decision.start(task, robot, scene.stance.imu)
-        change = size * np.eye(ACTION_AXES)[axis]
-        angles = []
-        for number in range(HORIZON):
-            now = np.asarray(float(number))
-            memory, targets = decision.controls(task, robot, memory, change, None, level, now)
-            for ctrl in scene.ctrl(targets):
-                data.ctrl = ctrl
-                mujoco.mj_step(scene.model, data)
-                angles.append(roll_pitch(data.qpos[scene.trunk_quat])[axis])
-            change = 0 * change
-        gains.append(angles[-1] / size)
-        courses.append(np.asarray(angles) / angles[-1])
-    return Response(np.asarray(gains), np.asarray(courses))
+    task = scene.config.task
+    change = task.action_max / 2 * np.eye(ACTION_AXES)
+    axes = np.arange(ACTION_AXES)
+    still = np.zeros(ACTION_AXES)
+    level = tilt.Scenario(np.zeros((ACTION_AXES, 1, 2)), still, still + task.board_rate)
+    env, angles = BatchEnv(scene, Episodes(level), threads=1), []
+    for number in range(HORIZON):
+        env.step(change if number == 0 else 0 * change)
+        angles.append(np.stack(roll_pitch(env.path[..., scene.trunk_quat]))[axes, axes])
+    course = np.concatenate(angles, axis=-1)
+    end = course[:, -1]
+    return Response(end / change.diagonal(), course / end[:, None])
 
 
 def attitude(scene: Scene, view: View) -> np.ndarray:
@@ -127,8 +119,8 @@ class AttitudePD:
     def __call__(self, view: View) -> np.ndarray:
         """Returns action indices (n,)."""
         angle, speed = self.state(view)
-        wanted = -(self.proportional * angle + self.rate * speed) / self.gain
-        return nearest_action(self.task, wanted)
+        change = -(self.proportional * angle + self.rate * speed) / self.gain
+        return nearest_action(self.task, change)
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Roll and pitch (n, 2), deg, and their rates (n, 2), deg/s."""
@@ -161,7 +153,7 @@ class ImuPD(AttitudePD):
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Filters the last decision's samples; see `AttitudePD.state`."""
-        if view.decision == 0:
+        if view.env_steps == 0:
             self.angle = np.zeros((view.ids.max() + 1, ACTION_AXES))
         gyro, accel = view.imu[..., :2], view.imu[..., 3:]
         lean = np.arctan2(accel[..., 1], accel[..., 2])
@@ -209,12 +201,12 @@ class Predictive:
     def __call__(self, view: View) -> np.ndarray:
         """Returns action indices (n,)."""
         task, n = self.task, len(view.ids)
-        if view.decision == 0:
+        if view.env_steps == 0:
             self.chosen = np.zeros((2, view.ids.max() + 1, ACTION_AXES))
         older, newer = self.chosen[:, view.ids]
-        late = view.late[:, None]
+        delayed = view.delayed[:, None]
         ahead = task.sim_dt * np.arange(1, HORIZON * task.sim_steps + 1)
-        now = np.full(n, view.decision * task.ctrl_dt)
+        now = np.full(n, view.env_steps * task.ctrl_dt)
         board = self.forecast(task, view.scenario, now, ahead)
         w, x, y, z = view.qpos[:, self.scene.trunk_quat].T
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))[:, None]
@@ -226,18 +218,18 @@ class Predictive:
             axis=-1,
         )
         free = attitude(self.scene, view)[:, None] + board
-        free = free + np.where(late, older, newer)[:, None] * self.unfinished.T
+        free = free + np.where(delayed, older, newer)[:, None] * self.unfinished.T
         linear = np.einsum("xjt,ntx->nxj", self.effect, free)
         limit = np.abs(self.gain) * task.action_max
         plan = np.zeros((n, ACTION_AXES, HORIZON))
-        plan[..., 0] = np.where(late, newer, 0)
+        plan[..., 0] = np.where(delayed, newer, 0)
         for _ in range(SWEEPS):
             for j in range(HORIZON):
                 slope = linear[..., j] + np.einsum("nxk,xk->nx", plan, self.gram[:, j])
                 moved = plan[..., j] - slope / self.gram[:, j, j]
-                fixed = late & (j == 0)
+                fixed = delayed & (j == 0)
                 plan[..., j] = np.where(fixed, plan[..., j], np.clip(moved, -limit, limit))
-        choice = np.where(late, plan[..., 1], plan[..., 0])
+        choice = np.where(delayed, plan[..., 1], plan[..., 0])
         self.chosen[:, view.ids] = newer, choice
         return nearest_action(task, choice / self.gain)
 

@@ -1,21 +1,22 @@
-"""The evaluation suites: which boards and circumstances a controller is tried on."""
+"""The evaluation suites: scenarios, domain parameters and pushes that a controller is tried on."""
 
 import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 
-from mjx_balance.config import Config, RandomizationConfig
+from mjx_balance.config import Config, RandomizationConfig, TaskConfig
+from mjx_balance.envs.batch import Episodes
 from mjx_balance.errors import InputError
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.robots.limits import authority, greatest_incline, scale_ranges
 from mjx_balance.task import tilt
-from mjx_balance.task.pushes import Pushes, draw_kicks, kicked_decisions
-from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
+from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
+from mjx_balance.task.randomization import DRAWS, draw_params
 
 
 class SuiteError(InputError):
-    """A suite that does not exist, or does not suit the config; the message says why."""
+    """A suite that does not exist, or does not fit the config; the message says why."""
 
 
 def _disc(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
@@ -56,7 +57,7 @@ SUITES: dict[str, Suite] = {
     "gains": Suite("servo gains off by up to 20%", RandomizationConfig(gain_spread=0.2)),
     "latency": Suite("every action one decision late", RandomizationConfig(latency_share=1.0)),
     "push": Suite(
-        "the trunk kicked to 0.2 to 0.4 m/s in any direction, every 5 s",
+        "pushes of 0.2 to 0.4 m/s in any direction, every 5 s",
         RandomizationConfig(push_min=0.2, push_max=0.4),
     ),
     "fast": Suite("board speeds up to what the action set can follow", fast=True),
@@ -106,12 +107,18 @@ def check_seed(seed: int) -> None:
         raise SuiteError(f"seed is {seed}; it must not be negative")
 
 
-def make_scenarios(
-    config: Config, suite: str, scenarios: int, duration: float, seed: int
-) -> tuple[tilt.Scenario, Conditions]:
-    """Draws a suite's scenarios and the circumstances they happen in.
+def draw_suite(config: Config, suite: str, scenarios: int, duration: float, seed: int) -> Episodes:
+    """Draws a suite's episodes.
 
-    Scenario k of a seed is the same however many are drawn.
+    Scenario k of a seed is the same however many are drawn. Scenario, sensor noise and pushes come
+    from generators of their own, told apart by their last number.
+
+    Args:
+      config: robot and task.
+      suite: its name.
+      scenarios: how many.
+      duration: of each, s.
+      seed: not negative.
 
     Raises:
       SuiteError: for an unknown suite, a negative seed, or a board that does not arrive
@@ -135,23 +142,22 @@ def make_scenarios(
             f"target_period is {task.target_period} s, but in suite {suite!r} the board may take "
             f"{longest:.1f} s to its target; the period must not be shorter"
         )
-    scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     ranges = scale_ranges(chosen.randomization, robot)
-    return scenario, draw_conditions(ranges, robot, others[:, :DRAWS])
+    return Episodes(
+        scenario=tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate),
+        params=draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None,
+        pushes=_draw_pushes(task, ranges, scenarios, duration, seed),
+        rngs=[np.random.default_rng((seed, k, 1)) for k in range(scenarios)],
+    )
 
 
-def make_pushes(config: Config, suite: str, scenarios: int, duration: float, seed: int) -> Pushes:
-    """Draws a suite's pushes, for the scenarios of the same arguments.
-
-    Those of scenario k of a seed are the same however many are drawn and however long they last:
-    they come from a generator of their own, told by its last number from those that draw the
-    scenario and its noise (evaluation.py).
-
-    Raises:
-      SuiteError: for an unknown suite.
-    """
-    ranges = scale_ranges(find_suite(suite).randomization, find_robot(config.robot))
-    at = kicked_decisions(config.task, ranges, duration)
+def _draw_pushes(
+    task: TaskConfig, ranges: RandomizationConfig, scenarios: int, duration: float, seed: int
+) -> Pushes | None:
+    """Pushes of scenario k are the same however many are drawn and however long they last."""
+    due = push_decisions(task, ranges, duration)
+    if not len(due):
+        return None
     rngs = [np.random.default_rng((seed, k, 2)) for k in range(scenarios)]
-    uniform = np.asarray([rng.uniform(size=(len(at), 2)) for rng in rngs])
-    return Pushes(draw_kicks(ranges, uniform), at)
+    uniform = np.asarray([rng.uniform(size=(len(due), 2)) for rng in rngs])
+    return Pushes(draw_velocity(ranges, uniform), np.tile(due, (scenarios, 1)))

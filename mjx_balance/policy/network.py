@@ -16,7 +16,7 @@ class Policy:
     """A greedy policy in NumPy.
 
     Calling it maps observations to action indices. `.manifest` is the file's JSON,
-    `.config` the config it was trained with, ``.robot`` the robot, `.actions` the
+    `.config` the config it was trained with, `.robot` the robot, `.actions` the
     (num_actions, 2) height changes in m that the indices stand for, `.layers` the kernels
     and biases.
     """

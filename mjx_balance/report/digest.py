@@ -1,11 +1,11 @@
-"""Digest of the code that decides a result: a saved result of other code is out of date."""
+"""Digest of the code that decides a result, so that a kept one is known to be out of date."""
 
 import hashlib
 from pathlib import Path
 
 import mujoco
 
-from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.evaluation import envelope
 from mjx_balance.files.sources import PACKAGE, code
 
 
@@ -20,6 +20,6 @@ def code_digest(package: Path = PACKAGE) -> str:
     Returns:
       16 hexadecimal digits.
     """
-    sources = code(evaluation.__name__, package)
+    sources = code(envelope.__name__, package)
     parts = [mujoco.__version__, *(f"{name}:{text}" for name, text in sorted(sources.items()))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

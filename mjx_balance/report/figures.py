@@ -10,7 +10,8 @@ import matplotlib as mpl
 import numpy as np
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.evaluation.rollout import Envelope, Rollout
+from mjx_balance.evaluation.envelope import Envelope
+from mjx_balance.evaluation.rollout import Rollout
 from mjx_balance.evaluation.suites import HEADLINE
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.sim.scene import Scene

@@ -12,16 +12,10 @@ from annotated_types import Len
 
 from mjx_balance.config import to_dict
 from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_controller
-from mjx_balance.evaluation.rollout import (
-    Envelope,
-    Rollout,
-    envelope,
-    observing,
-    policy_scene,
-    run_suite,
-    summarize,
-)
+from mjx_balance.evaluation.envelope import Envelope, envelope
+from mjx_balance.evaluation.rollout import Rollout, observing, policy_scene, run_suite
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.evaluation.summary import summarize
 from mjx_balance.files.run_folder import read_json
 from mjx_balance.files.validation import parse
 from mjx_balance.policy.file import Policy

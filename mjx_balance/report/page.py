@@ -12,9 +12,11 @@ import jinja2
 import numpy as np
 
 from mjx_balance.config import Config, ConfigError, TaskConfig, flatten, preset, to_dict
-from mjx_balance.evaluation.rollout import SETTLED_SECONDS, Envelope, policy_scene
+from mjx_balance.evaluation.envelope import Envelope
+from mjx_balance.evaluation.rollout import policy_scene
 from mjx_balance.evaluation.statistics import TILTS, over_seeds
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
+from mjx_balance.evaluation.summary import SETTLED_SECONDS
 from mjx_balance.files.run_folder import RunFolder, write_atomically
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.render import drawing as render

@@ -228,17 +228,16 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
     if before and line.env_steps <= before[-1]["env_steps"]:
         raise ReportError(f"env_steps is {line.env_steps}; it must be more than in the line before")
     metrics = {name: line.metrics.get(name, math.nan) for name in names}
-    row: dict[str, Any] = {"env_steps": line.env_steps, **metrics}
+    found: dict[str, Any] = {"env_steps": line.env_steps, **metrics}
     if seeds:
-        row["seeds"] = {
-            name: [math.nan if x is None else x for x in values]
-            for name, values in line.seeds.items()
+        found["seeds"] = {
+            name: [math.nan if x is None else x for x in row] for name, row in line.seeds.items()
         }
-    if 0 in _counts(row).values():
+    if 0 in _counts(found).values():
         raise ReportError("it holds no seed")
-    if before and _counts(row) != _counts(before[0]):
+    if before and _counts(found) != _counts(before[0]):
         raise ReportError("other seeds than in line 1")
-    return row
+    return found
 
 
 def _counts(line: dict[str, Any]) -> dict[str, int]:

@@ -236,7 +236,7 @@ def _joints_below(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
     return [j for x in (body, *body.find_all(mujoco.mjtObj.mjOBJ_BODY)) for j in x.joints]
 
 
-class _FootPlace(NamedTuple):
+class _Found(NamedTuple):
     """A foot in its model."""
 
     body: mujoco.MjsBody
@@ -252,23 +252,23 @@ class _FootPlace(NamedTuple):
         return geom if geom and geom.type == mujoco.mjtGeom.mjGEOM_SPHERE else None
 
 
-def _foot(spec: mujoco.MjSpec, foot: str | Foot, leg: str) -> _FootPlace:
+def _foot(spec: mujoco.MjSpec, foot: str | Foot, leg: str) -> _Found:
     origin = (0.0, 0.0, 0.0)
     if isinstance(foot, Foot):
         body = _find(spec.bodies[1:], foot.body, f"foot of leg {leg}", "bodies")
-        return _FootPlace(body, foot.offset, None)
+        return _Found(body, foot.offset, None)
     for element in (*spec.geoms, *spec.sites):
         if element.name == foot:
-            return _FootPlace(element.parent, origin, element)
+            return _Found(element.parent, origin, element)
     for body in spec.bodies:
         if body.name == foot:
-            return _FootPlace(body, origin, None)
+            return _Found(body, origin, None)
     raise RobotError(
         f"foot of leg {leg} is {quote(foot)}, which is no geom, site or body of its model"
     )
 
 
-def _foot_radius(file: RobotFile, feet: dict[str, _FootPlace]) -> float:
+def _foot_radius(file: RobotFile, feet: dict[str, _Found]) -> float:
     if file.foot_radius is not None:
         return file.foot_radius
     sizes = {name: float(x.sphere.size[0]) for name, x in feet.items() if x.sphere is not None}
@@ -302,9 +302,7 @@ def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
     compiler.balanceinertia = False
 
 
-def _spheres(
-    spec: mujoco.MjSpec, feet: dict[str, _FootPlace], radius: float
-) -> list[mujoco.MjsGeom]:
+def _spheres(spec: mujoco.MjSpec, feet: dict[str, _Found], radius: float) -> list[mujoco.MjsGeom]:
     """Of each leg, the foot's own sphere, or a new one in its place."""
     own = {
         name: foot.sphere
@@ -359,19 +357,19 @@ def _leave_geoms(
     spec: mujoco.MjSpec, trunk: mujoco.MjsBody, feet: list[mujoco.MjsGeom], visual: bool
 ) -> None:
     """Leaves the feet, which only the board touches, and what is looked at, if wanted."""
-    own = {x.name for x in feet}
-    others = [g for g in spec.geoms if g.name not in own]
+    kept = {x.name for x in feet}
+    others = [g for g in spec.geoms if g.name not in kept]
     solid = [g for g in others if g.contype or g.conaffinity]
     looks = [g for g in others if not (g.contype or g.conaffinity)]
-    visible = (looks or solid) if visual else []
+    shown = (looks or solid) if visual else []
     for geom in (*looks, *solid) if not visual else solid if looks else ():
         spec.delete(geom)
-    for geom in (*visible, *feet):
+    for geom in (*shown, *feet):
         geom.contype = geom.conaffinity = 0
         geom.mass = 0
     for geom in feet:
         geom.group = FOOT_GROUP
-    for geom in visible:
+    for geom in shown:
         geom.group = VISUAL_GROUP
     if not visual:
         for element in (*feet, *spec.sites):

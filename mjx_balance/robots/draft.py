@@ -65,8 +65,8 @@ def draft(model: str, path: Path) -> str:
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
     trunk = _trunk(compiled, path)
-    candidates = [(chain, _foot(compiled, data, chain)) for chain in _chains(compiled, trunk)]
-    legs = sorted(candidates, key=lambda leg: leg[1].place[2])[:4]
+    found = [(chain, _foot(compiled, data, chain)) for chain in _chains(compiled, trunk)]
+    legs = sorted(found, key=lambda leg: leg[1].place[2])[:4]
     if len(legs) < 4:
         names = ", ".join(compiled.joint(chain.joints[0]).name for chain, _ in legs) or "none"
         raise RobotError(

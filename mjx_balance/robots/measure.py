@@ -117,11 +117,11 @@ def check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
 
 def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
     """The bodies that a body hangs on, without itself, up to the world."""
-    bodies = []
+    found = []
     while body:
         body = int(model.body_parentid[body])
-        bodies.append(body)
-    return bodies
+        found.append(body)
+    return found
 
 
 class Pose:
@@ -164,8 +164,8 @@ def _standing_height(robot: Body) -> float:
     stretched = [
         leg.drop - leg.axis_height + STRETCH * (leg.thigh + leg.calf) for leg in robot.legs
     ]
-    stance = robot.foot_radius + float(np.mean(stretched))
-    return round(min(max(stance, low + room), high - room), 3)
+    wanted = robot.foot_radius + float(np.mean(stretched))
+    return round(min(max(wanted, low + room), high - room), 3)
 
 
 def _stiffer(robot: Body, height: float) -> float:
@@ -374,8 +374,8 @@ def _bent(
         return turns[(leans >= hip[0] + whole) & (leans <= hip[1] + whole)]
 
     thigh = max(WHOLE_TURNS, key=lambda whole: len(good(whole)))
-    usable = good(thigh)
-    return _Bend(float(usable[0]), float(usable[-1]), thigh, calf) if len(usable) else None
+    kept = good(thigh)
+    return _Bend(float(kept[0]), float(kept[-1]), thigh, calf) if len(kept) else None
 
 
 def _clean(value: float) -> float:

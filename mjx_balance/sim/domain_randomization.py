@@ -1,4 +1,4 @@
-"""What a payload, friction and servo gains change of a compiled model."""
+"""Domain randomisation of a compiled model: payload, friction and servo gains."""
 
 import dataclasses
 import functools
@@ -9,36 +9,39 @@ import numpy as np
 
 from mjx_balance.sim.scene import ROBOT, Scene
 from mjx_balance.task import Array
-from mjx_balance.task.randomization import Conditions
+from mjx_balance.task.randomization import DomainParams
+
+MODEL_PARAMS = ("payload", "payload_at", "friction", "gain")
+"""Parameters that change the model."""
 
 
-def model_fields(scene: Scene, conditions: Conditions) -> dict[str, Array]:
-    """The model's fields in given circumstances, for `mjx.Model.replace` or `Batch.expand`.
+def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
+    """The model's fields under domain parameters, for `mjx.Model.replace` or `Batch.expand`.
 
     The payload is a point mass; its products of inertia about the trunk's principal axes are
     left out.
 
     Args:
       scene: the nominal model.
-      conditions: of one env or scenario, or of a batch (...).
+      params: of one env or scenario, or of a batch (...).
 
     Returns:
       Field name -> (..., *shape of the field).
     """
-    model, xp = scene.model, conditions.payload.__array_namespace__()
+    model, xp = scene.model, params.payload.__array_namespace__()
     trunk = model.body(f"{ROBOT}{scene.robot.trunk}").id
-    load, at = conditions.payload[..., None], conditions.payload_at
+    load, at = params.payload[..., None], params.payload_at
     mass, centre = model.body_mass[trunk], model.body_ipos[trunk]
     moved = (mass * centre + load * at) / (mass + load)
     arm = (at - centre) @ _principal(model, trunk)
     spread = xp.sum(arm**2, axis=-1, keepdims=True) - arm**2
     inertia = model.body_inertia[trunk] + mass * load / (mass + load) * spread
-    gain = conditions.gain[..., None]
-    friction = conditions.friction[..., None, None] * np.ones((model.npair, 2))
+    gain = params.gain[..., None]
+    friction = params.friction[..., None, None] * np.ones((model.npair, 2))
     stiffness = model.actuator_gainprm[scene.leg_ctrl.ravel(), 0] * gain
 
     def put(field: np.ndarray, where: tuple[Any, ...], value: Array) -> Array:
-        base = xp.zeros((*value.shape[: conditions.payload.ndim], *field.shape)) + field
+        base = xp.zeros((*value.shape[: params.payload.ndim], *field.shape)) + field
         if hasattr(base, "at"):  # JAX arrays are immutable
             return base.at[(..., *where)].set(value)
         base[(..., *where)] = value

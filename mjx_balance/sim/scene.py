@@ -17,8 +17,8 @@ from mjx_balance.robots.build import (
 from mjx_balance.robots.catalogue import Robot, find_robot, robot_file, robot_spec
 from mjx_balance.robots.limits import check_robot
 from mjx_balance.task import Array
-from mjx_balance.task.decision import Targets
 from mjx_balance.task.kinematics import joint_angles
+from mjx_balance.task.step import Targets
 
 ROBOT, BOARD = "robot/", "board/"
 CONTACT_TIME = 0.01

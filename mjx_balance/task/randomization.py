@@ -1,4 +1,4 @@
-"""What may differ from one robot and board to the next: noise, payload, friction, gains, delay."""
+"""Domain randomisation: noise, payload, friction, gains and delay differ from env to env."""
 
 from typing import NamedTuple
 
@@ -9,11 +9,11 @@ from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
 DRAWS = 6
-"""Uniform random numbers that the conditions of one env or scenario take."""
+"""Uniform random numbers that the parameters of one env take."""
 
 
-class Conditions(NamedTuple):
-    """The circumstances of one env or scenario, or of a batch of them."""
+class DomainParams(NamedTuple):
+    """What differs from env to env, of one env or of a batch of them."""
 
     imu_noise: Array
     """(..., 6) standard deviation of every IMU sample, rad/s and m/s^2."""
@@ -25,12 +25,12 @@ class Conditions(NamedTuple):
     """(...) sliding friction of the feet."""
     gain: Array
     """(...) factor on the leg servos' position gain."""
-    latency: Array
+    delay: Array
     """(...) decisions between choosing an action and taking it, 0 or 1."""
 
 
-def draw_conditions(ranges: RandomizationConfig, robot: Robot, uniform: Array) -> Conditions:
-    """Turns random numbers into conditions.
+def draw_params(ranges: RandomizationConfig, robot: Robot, uniform: Array) -> DomainParams:
+    """Turns random numbers into domain parameters.
 
     Args:
       ranges: how far things may differ; those of the preset `paper` leave everything as it is.
@@ -38,7 +38,7 @@ def draw_conditions(ranges: RandomizationConfig, robot: Robot, uniform: Array) -
       uniform: (..., DRAWS) in [0, 1).
 
     Returns:
-      Conditions with the leading dimensions of `uniform`.
+      Parameters with the leading dimensions of `uniform`.
     """
     xp = uniform.__array_namespace__()
     u = xp.moveaxis(uniform, -1, 0)
@@ -50,11 +50,11 @@ def draw_conditions(ranges: RandomizationConfig, robot: Robot, uniform: Array) -
     )
     friction_min = robot.foot_friction if ranges.friction_min is None else ranges.friction_min
     friction_max = robot.foot_friction if ranges.friction_max is None else ranges.friction_max
-    return Conditions(
+    return DomainParams(
         imu_noise=xp.zeros_like(u[0])[..., None] + sigma,
         payload=ranges.payload * u[0],
         payload_at=at,
         friction=friction_min + (friction_max - friction_min) * u[3],
         gain=1 + ranges.gain_spread * (2 * u[4] - 1),
-        latency=(u[5] < ranges.latency_share).astype(uniform.dtype),
+        delay=(u[5] < ranges.latency_share).astype(uniform.dtype),
     )

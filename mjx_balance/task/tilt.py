@@ -1,5 +1,6 @@
 """Board tilt: a scenario is a value, and the board's angle a closed form of it."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from mjx_balance.task import Array
 
 
 class Scenario(NamedTuple):
-    """Where the board is told to go (paper 3.1).
+    """Where the board goes (paper 3.1).
 
     The board starts level. It takes aim at `targets[k]` at time
     `k * target_period - phase` and stays there once it has arrived.
@@ -29,7 +30,7 @@ def num_targets(task: TaskConfig, duration: float) -> int:
 
 
 def board_angle(task: TaskConfig, scenario: Scenario, time: Array) -> Array:
-    """Commanded board angle.
+    """Target angle of the board.
 
     Each axis moves at `rate` from the last target to the next and then rests;
     it always arrives within the period (config checks that for the training, the
@@ -76,27 +77,27 @@ def disc_targets(incline: Array, direction: Array, magnitude: Array) -> Array:
 
 
 def draw_scenario(
-    task: TaskConfig, disc: Array, square: Array, which: Array, phase: Array
+    task: TaskConfig, uniform: Callable[[tuple[int, ...], float, float], Array]
 ) -> Scenario:
-    """Turns random numbers into a scenario of training.
+    """Draws one scenario of training, long enough for an episode.
 
     The random phase keeps thousands of boards from turning at the same time.
 
     Args:
-      task: inclines, the share of the square, the board's speed.
-      disc: (2, ..., n) in [0, 1): direction and magnitude of targets in the disc.
-      square: (..., n, 2) in [-1, 1): targets in the square.
-      which: (..., n, 1) in [0, 1): decides between the two.
-      phase: (...) in [0, 1): share of the period that the first target is old.
-
-    Returns:
-      A scenario, or a batch of them (...).
+      task: inclines, the share of the square, the board's speed, the episode's length.
+      uniform: (shape, low, high) -> new random numbers in [low, high); the four calls always come
+        in the same order.
     """
-    xp = disc.__array_namespace__()
-    limit = xp.asarray(task.max_incline, dtype=disc.dtype)
-    targets = xp.where(which < task.square_share, limit * square, disc_targets(limit, *disc))
+    count = num_targets(task, task.episode_length * task.ctrl_dt)
+    direction, magnitude = uniform((2, count), 0.0, 1.0)
+    square = uniform((count, 2), -1.0, 1.0)
+    in_square = uniform((count, 1), 0.0, 1.0) < task.square_share
+    phase = uniform((), 0.0, 1.0)
+    xp = square.__array_namespace__()
+    limit = xp.asarray(task.max_incline, dtype=square.dtype)
+    targets = xp.where(in_square, limit * square, disc_targets(limit, direction, magnitude))
     # The board starts level, so the first target is one it has already reached.
-    first = np.arange(targets.shape[-2])[:, None] == 0
+    first = np.arange(count)[:, None] == 0
     targets = xp.where(first, xp.zeros_like(targets), targets)
     rate = xp.zeros_like(phase) + task.board_rate
     return Scenario(targets, phase * task.target_period, rate)

@@ -23,6 +23,7 @@ from jax import export
 from mjx_balance.config import Config, to_dict
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.files.sources import code
+from mjx_balance.machine import cores
 from mjx_balance.robots.catalogue import robot_xml
 from mjx_balance.sim.engines import ffi
 from mjx_balance.sim.scene import scene_dir
@@ -114,7 +115,8 @@ def program_key(config: Config, iterations: int, root: str) -> str:
     values = {k: v for k, v in to_dict(config).items() if k not in NOT_TRACED}
     devices = [(device.platform, device.device_kind) for device in jax.devices()]
     flags = [str(getattr(jax.config, name)) for name in FLAGS]
-    key = hashlib.sha256(repr((values, iterations, devices, flags, versions())).encode())
+    traced = (values, iterations, devices, cores(), flags, versions())
+    key = hashlib.sha256(repr(traced).encode())
     key.update(repr(sorted(code(root).items())).encode())
     for path in sorted(scene_dir().glob("*.xml")):
         key.update(path.name.encode() + b"\0" + path.read_bytes())

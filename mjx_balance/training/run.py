@@ -30,6 +30,7 @@ from mjx_balance.files.run_folder import (
 )
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report.progress import Display
+from mjx_balance.sim.engines.table import ENGINES
 from mjx_balance.training import (
     checkpoints,
     finish,
@@ -258,7 +259,7 @@ def prepare(
             key = None
             if profile:  # caches keep no names to profile by
                 jax.config.update("jax_enable_compilation_cache", False)
-            elif setup.config.engine != "warp":  # its kernels live in this process
+            elif ENGINES[setup.config.engine].cacheable:
                 key = program_cache.program_key(setup.config, plan.iterations, sizing.__name__)
             program = stop.run(program_cache.compile_program, program, state, key, display.say)
     processes.gather(None)  # whoever compiles longest is awaited here, where nothing times out

@@ -25,8 +25,9 @@ from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 from mjx_balance.dqn.mesh import REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import write_json
+from mjx_balance.machine import cores
 from mjx_balance.policy.manifest import network_factors
-from mjx_balance.sim.engines.mujoco import cores
+from mjx_balance.sim.engines.table import check_platform
 from mjx_balance.training.program_cache import LogFn, cache_dir, enable_compilation_cache
 
 SIZES_FILE = "sizes.json"
@@ -83,26 +84,13 @@ def size_to_device(config: Config, most: int | None = None) -> Config:
     Raises:
       ConfigError: if the engine does not run on it, or the envs cannot be spread over its devices.
     """
-    _check_engine(config.engine)
+    device = jax.devices()[0]
+    check_platform(config.engine, device.platform, device.device_kind)
     if config.num_envs is None:
         config = scale_sizes(config, _default_envs(config.engine, most))
     assert config.num_envs is not None
     num_devices = _share_out(config.num_devices, config.num_envs, config.dqn.batch_size)
     return check(dataclasses.replace(config, num_devices=num_devices))
-
-
-def _check_engine(engine: str) -> None:
-    device = jax.devices()[0]
-    if engine == "mujoco" and device.platform != "cpu":
-        raise ConfigError(
-            f"engine is mujoco, which runs on CPUs, and JAX uses {device.device_kind}; set "
-            "JAX_PLATFORMS=cpu, or choose engine mjx"
-        )
-    if engine == "warp" and device.platform not in ("cpu", "gpu", "cuda"):
-        raise ConfigError(
-            f"engine is warp, which runs on NVIDIA GPUs and CPUs, and JAX uses "
-            f"{device.device_kind}; choose engine mjx"
-        )
 
 
 def _default_envs(engine: str, most: int | None) -> int:

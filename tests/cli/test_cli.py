@@ -15,7 +15,8 @@ from mjx_balance.cli.common import load_controller
 from mjx_balance.config import ConfigError, preset, to_dict
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.controllers import make_controller
-from mjx_balance.evaluation.rollout import observing, run_suite, summarize
+from mjx_balance.evaluation.rollout import observing, run_suite
+from mjx_balance.evaluation.summary import summarize
 from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked
 from mjx_balance.policy.file import PolicyError, load_policy
 from mjx_balance.render.drawing import VIDEO_SIZE

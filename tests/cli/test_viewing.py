@@ -6,7 +6,7 @@ import pytest
 from mjx_balance.cli.viewing import DOWN, LEFT, LEVEL, PUSH_KEY, RIGHT, UP, Session
 from mjx_balance.evaluation.controllers import Controller, View, make_controller
 from mjx_balance.evaluation.rollout import run_suite
-from mjx_balance.evaluation.suites import SuiteError, make_scenarios
+from mjx_balance.evaluation.suites import SuiteError, draw_suite
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.tilt import board_angle
 
@@ -40,7 +40,7 @@ def test_the_board_goes_where_the_keys_say(
     one = session(scene)
     for key in keys:
         one.press(key)
-    states = np.stack([one.decide() for _ in range(25)])
+    states = np.stack([one.step() for _ in range(25)])
     np.testing.assert_allclose(board(scene, states[-1])[-1], wanted, atol=0.05)
     way = np.abs(np.diff(np.asarray([board(scene, x)[-1] for x in states]), axis=0)).max()
     assert way <= 0.7 + 0.02
@@ -53,9 +53,9 @@ def test_a_target_that_changes_on_the_way(scene: Scene) -> None:
     one = session(scene)
     for _ in range(5):
         one.press(RIGHT)
-    path = [board(scene, one.decide()) for _ in range(2)]
+    path = [board(scene, one.step()) for _ in range(2)]
     one.press(LEVEL)
-    path += [board(scene, one.decide()) for _ in range(4)]
+    path += [board(scene, one.step()) for _ in range(4)]
     roll = np.concatenate(path)[:, 0]
     assert roll.max() == pytest.approx(1.4, abs=0.05)
     assert np.abs(np.diff(roll)).max() < 0.03
@@ -67,7 +67,7 @@ def test_the_caption_has_the_boards_roll_before_its_pitch(scene: Scene) -> None:
     for key in (RIGHT, RIGHT, DOWN):
         one.press(key)
     for _ in range(5):
-        one.decide()
+        one.step()
     tilt, board, falls = one.caption()[1].splitlines()
     assert (board, falls) == ("+2.0, +1.0 deg", "0")
     assert tilt == f"{one.tilt:.2f} deg"
@@ -76,9 +76,9 @@ def test_the_caption_has_the_boards_roll_before_its_pitch(scene: Scene) -> None:
 def test_a_push_moves_the_robot_once(scene: Scene) -> None:
     one, other = session(scene), session(scene)
     one.press(PUSH_KEY)
-    moved, quiet = one.decide(), other.decide()
+    pushed, quiet = one.step(), other.step()
     root = scene.trunk_quat[0] - 3
-    way = np.linalg.norm(moved[1, root : root + 2] - quiet[1, root : root + 2])
+    way = np.linalg.norm(pushed[1, root : root + 2] - quiet[1, root : root + 2])
     assert way == pytest.approx(0.4 * 0.008, rel=0.15), "0.4 m/s over two physics steps"
     assert not one.push.any()
 
@@ -88,12 +88,12 @@ def test_who_falls_is_put_back_up_on_a_level_board(scene: Scene) -> None:
     for _ in range(8):
         one.press(RIGHT)
     for _ in range(20):
-        one.decide()
+        one.step()
         if one.falls:
             break
     assert one.falls == 1
     assert one.caption() == ("body tilt\nboard\nfalls", "0.00 deg\n+0.0, +0.0 deg\n1")
-    np.testing.assert_allclose(one.decide()[0], scene.stance.qpos, atol=1e-3)
+    np.testing.assert_allclose(one.step()[0], scene.stance.qpos, atol=1e-3)
 
 
 @pytest.mark.parametrize("suite", ["push", "payload", "noise", "latency"])
@@ -104,7 +104,7 @@ def test_a_suite_is_shown_as_it_is_evaluated(scene: Scene, suite: str) -> None:
     assert rollout.qpos is not None
     one = session(scene, "pd-imu", suite)
     one.press(RIGHT)  # is not listened to
-    states = np.concatenate([one.decide() for _ in range(60)])
+    states = np.concatenate([one.step() for _ in range(60)])
     np.testing.assert_allclose(states, rollout.qpos[0, : len(states)], atol=1e-9)
 
 
@@ -112,9 +112,9 @@ def test_the_next_round_of_a_suite_is_another_one(scene: Scene) -> None:
     """That of the next seed; who stands still falls in every corner."""
     one = session(scene, "none", "corner")
     while one.falls < 2:
-        one.decide()
-    third, _ = make_scenarios(scene.config, "corner", 1, 60.0, seed=5)
-    np.testing.assert_array_equal(one.trials.scenarios.targets, third.targets)
+        one.step()
+    third = draw_suite(scene.config, "corner", 1, 60.0, seed=5).scenario
+    np.testing.assert_array_equal(one.env.state.scenario.targets, third.targets)
 
 
 def test_a_negative_seed_is_refused(scene: Scene) -> None:
@@ -123,14 +123,14 @@ def test_a_negative_seed_is_refused(scene: Scene) -> None:
             Session(scene, make_controller("none", scene), suite, seed=-1)
 
 
-def test_a_push_by_key_adds_to_those_of_a_suite(scene: Scene) -> None:
+def test_a_push_by_key_comes_beside_those_of_a_suite(scene: Scene) -> None:
     one, other = session(scene, suite="push"), session(scene, suite="push")
     for _ in range(8):
-        one.decide()
-        other.decide()
+        one.step()
+        other.step()
     one.press(PUSH_KEY)
     root = scene.trunk_quat[0] - 3
-    ways = [np.ptp(x[:, root : root + 2], axis=0) for x in (one.decide(), other.decide())]
+    ways = [np.ptp(x[:, root : root + 2], axis=0) for x in (one.step(), other.step())]
     assert np.linalg.norm(ways[0]) > 4 * np.linalg.norm(ways[1])
 
 
@@ -148,9 +148,9 @@ def test_who_acts_sees_where_the_keyed_board_goes(scene: Scene) -> None:
     for number in range(12):
         if number in (2, 3, 7):
             one.press((RIGHT, DOWN, LEFT)[number % 3])
-        states.append(board(scene, one.decide())[-1])
+        states.append(board(scene, one.step())[-1])
     told = [
-        board_angle(one.task, view.scenario, np.asarray([[(view.decision + 1) * 0.2]]))[0, 0]
+        board_angle(one.task, view.scenario, np.asarray([[(view.env_steps + 1) * 0.2]]))[0, 0]
         for view in seen
     ]
     np.testing.assert_allclose(states, told, atol=0.05)

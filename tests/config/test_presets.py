@@ -71,8 +71,8 @@ def test_presets_fit_any_number_of_envs_that_their_batch_divides(name: str) -> N
     ("name", "digest"),
     [
         ("default", "e82bd94e"),
-        ("best", "21701f43"),
-        ("quick", "5e04fda4"),
+        ("best", "e0e79557"),
+        ("quick", "f614618b"),
         ("smoke", "51dacd1d"),
     ],
 )

@@ -10,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax import envs
+from fixtures.fleet import with_state
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig, preset
 from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.envs.batch import Episodes
 from mjx_balance.envs.brax import wrap
 from mjx_balance.evaluation.controllers import View
 from mjx_balance.evaluation.rollout import roll_out, run_suite
-from mjx_balance.evaluation.suites import HEADLINE, SEEDS, make_scenarios
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS, draw_suite
 from mjx_balance.task.actions import action_table
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -69,7 +71,7 @@ def test_a_continuous_action_on_the_grid_does_what_its_index_does(env: BalanceEn
     ours = jax.jit(jax.vmap(env.step))(start, shares)
     theirs = jax.jit(jax.vmap(BalanceEnv(env.config).step))(start, index)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-4), ours, theirs)
-    heights = ours.info["memory"].heights
+    heights = ours.pipeline_state.memory.heights
     assert float(jnp.ptp(heights)) == pytest.approx(4 * env.config.task.action_max, rel=1e-5)
 
 
@@ -81,7 +83,7 @@ def test_a_continuous_action_is_two_numbers(env: BalanceEnv) -> None:
     after = jax.device_get(jax.jit(jax.vmap(env.step))(start, given))
     for leaf in jax.tree.leaves(after):
         np.testing.assert_array_equal(leaf[0], leaf[1])
-    moved = after.info["memory"].heights[2] - env.config.task.body_height
+    moved = after.pipeline_state.memory.heights[2] - env.config.task.body_height
     ahead_left, most = moved.max(), env.config.task.action_max
     assert ahead_left == pytest.approx((0.123 + 0.456) * most, rel=1e-4)
 
@@ -112,17 +114,18 @@ def test_after_its_end_an_episode_is_as_after_a_reset(env: BalanceEnv, states: l
     assert len(ends) >= LIFTING * 2 + STANDING * 2
 
     def parts(state: Any, k: Any) -> list[Any]:
-        own = [state.info[name] for name in ("memory", "decision", "decisions_left")]
-        return [leaf[k] for leaf in jax.tree.leaves((state.pipeline_state, state.obs, own))]
+        own = state.pipeline_state
+        parts = (own.physics, own.memory, own.env_steps, state.obs, state.info["episode_length"])
+        return [leaf[k] for leaf in jax.tree.leaves(parts)]
 
     for n, k in ends:
         state = states[n]
         for ours, expected in zip(parts(state, k), parts(fresh, k), strict=True):
             np.testing.assert_array_equal(ours, expected)
-        before, after = (s.info["scenario"] for s in (states[n - 1], state))
+        before, after = (s.pipeline_state.scenario for s in (states[n - 1], state))
         assert before.phase[k] != after.phase[k]
         assert (before.targets[k] != after.targets[k]).any()
-    begun = {float(states[n].info["scenario"].phase[k]) for n, k in ends}
+    begun = {float(states[n].pipeline_state.scenario.phase[k]) for n, k in ends}
     assert len(begun) == len(ends)
 
 
@@ -131,7 +134,7 @@ def test_the_next_episode_goes_as_its_scenario_says(env: BalanceEnv, states: lis
     """What an env does that was reset by hand and given the same scenario."""
     n = EPISODE
     plain: Any = jax.vmap(env.reset)(keys(ENVS))
-    plain = plain.replace(info=plain.info | {"scenario": states[n].info["scenario"]})
+    plain = with_state(plain, scenario=states[n].pipeline_state.scenario)
     step = jax.jit(jax.vmap(env.step))
     for after in states[n + 1 : n + 4]:
         plain = step(plain, ACTIONS)
@@ -144,7 +147,8 @@ def test_circumstances_are_drawn_anew_too() -> None:
     ranges = RandomizationConfig(payload=5.0, gyro_noise=0.01, push_max=0.2, push_period=0.4)
     found = wrapped_states(wrap(BalanceEnv(short(ranges), "continuous"), EPISODE), EPISODE)
     before, after = (
-        (s.info["conditions"].payload, s.info["noise_key"], s.info["kicks"]) for s in found[-2:]
+        (s.pipeline_state.params.payload, s.info["noise_key"], s.pipeline_state.pushes.velocity)
+        for s in found[-2:]
     )
     for a, b in zip(before, after, strict=True):
         for k in range(LIFTING, ENVS):
@@ -156,7 +160,7 @@ def test_an_action_can_be_repeated(env: BalanceEnv) -> None:
     """Two decisions a step, of which the time limit counts every one."""
     found = wrapped_states(wrap(env, EPISODE, 2), EPISODE // 2)
     assert [float(s.done[-1]) for s in found] == [0, 0, 0, 0, 1]
-    assert found[1].info["decision"].tolist() == [2] * ENVS
+    assert found[1].pipeline_state.env_steps.tolist() == [2] * ENVS
 
 
 @pytest.mark.slow
@@ -164,7 +168,7 @@ def test_braxs_own_wrapping_would_not_do(env: BalanceEnv) -> None:
     """It leaves memory and clock as the last episode had them: why `wrap` is there."""
     found = wrapped_states(envs.training.wrap(env, EPISODE), EPISODE + 2)
     fell = int(np.argmax([s.done[0] for s in found]))
-    assert found[fell].info["memory"].heights[0].std() > 0.01
+    assert found[fell].pipeline_state.memory.heights[0].std() > 0.01
     over = np.asarray([s.done[-1] for s in found[EPISODE:]])
     np.testing.assert_array_equal(over, 1)
     assert found[EPISODE].info["truncation"][-1] == 0
@@ -189,13 +193,13 @@ def test_braxs_trainers_get_a_copy_of_every_leaf_per_device() -> None:
 def test_an_evaluation_takes_height_changes_too(env: BalanceEnv) -> None:
     """Of those of the grid it makes what it makes of their indices."""
     scene, table = env.scene, action_table(env.config.task)
-    scenarios, _ = make_scenarios(scene.config, "corner", 3, 2.0, 0)
+    scenarios = draw_suite(scene.config, "corner", 3, 2.0, 0).scenario
 
     def index(view: View) -> np.ndarray:
-        return (view.ids * 97 + view.decision * 31) % 441
+        return (view.ids * 97 + view.env_steps * 31) % 441
 
-    first = roll_out(scene, index, scenarios, 2.0)
-    again = roll_out(scene, lambda view: table[index(view)], scenarios, 2.0)
+    first = roll_out(scene, index, Episodes(scenarios), 2.0)
+    again = roll_out(scene, lambda view: table[index(view)], Episodes(scenarios), 2.0)
     np.testing.assert_array_equal(first.tilt, again.tilt)
     np.testing.assert_array_equal(first.action_mm, again.action_mm)
 

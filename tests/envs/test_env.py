@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from fixtures.fleet import with_state
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config
@@ -27,14 +28,16 @@ PUSHES = 8
 @pytest.fixture(scope="module")
 def pushed(fleet: Any) -> list[Any]:
     """States of 8 decisions on level boards, each env taking one action again and again."""
-    conditions = fleet.nominal()._replace(latency=LATE.astype(np.float32))
+    conditions = fleet.nominal()._replace(delay=LATE.astype(np.float32))
     state = fleet.level(fleet.under(fleet.reset(fleet.keys(2)), conditions))
     return fleet.drive(state, lambda obs, number: LASTING, PUSHES)
 
 
 def roll_pitch(fleet: Any, states: list[Any]) -> np.ndarray:
     """(len(states), ENVS, 2) deg."""
-    quat = np.asarray([s.pipeline_state.qpos[:, fleet.env.scene.trunk_quat] for s in states])
+    quat = np.asarray(
+        [s.pipeline_state.physics.qpos[:, fleet.env.scene.trunk_quat] for s in states]
+    )
     turn = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True).as_euler("xyz", degrees=True)
     return turn.reshape(len(states), ENVS, 3)[..., :2]
 
@@ -49,7 +52,9 @@ def test_starts_settled_and_level(fleet: Any, config: Config) -> None:
         assert env.action_factors == (21, 21)
         assert (float(state.reward), float(state.done)) == (0, 0)
         stance = env.scene.stance
-        np.testing.assert_allclose(state.pipeline_state.qpos, stance.qpos, rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(
+            state.pipeline_state.physics.qpos, stance.qpos, rtol=1e-6, atol=1e-7
+        )
 
 
 def test_actions_go_the_way_that_the_paper_says(fleet: Any, pushed: list[Any]) -> None:
@@ -70,7 +75,7 @@ def test_actions_go_the_way_that_the_paper_says(fleet: Any, pushed: list[Any]) -
 
 
 def test_late_robots_do_the_same_one_decision_later(pushed: list[Any]) -> None:
-    qpos = np.asarray([s.pipeline_state.qpos for s in pushed])
+    qpos = np.asarray([s.pipeline_state.physics.qpos for s in pushed])
     prompt = [int(np.flatnonzero((LASTING[e] == LASTING) & ~LATE)[0]) for e in range(ENVS)]
     for env in np.flatnonzero(LATE):
         np.testing.assert_allclose(qpos[1, env], qpos[0, env], atol=1e-4)
@@ -134,9 +139,9 @@ def test_episodes_end_by_the_time_limit(closed_loop: list[Any]) -> None:
 def test_a_fall_at_the_time_limit_is_a_fall(fleet: Any, pushed: list[Any]) -> None:
     state = pushed[4]
     for _ in range(2):
-        left = jnp.ones(ENVS, state.info["decisions_left"].dtype)
+        last = state.pipeline_state.env_steps + 1
         info = {name: value for name, value in state.info.items() if name != "action"}
-        state = fleet.step(state.replace(info=info | {"decisions_left": left}), LASTING)
+        state = fleet.step(state.replace(info=info | {"episode_length": last}), LASTING)
     fell = np.asarray(state.metrics["fall"]) == 1
     assert 0 < fell.sum() < ENVS
     np.testing.assert_array_equal(np.asarray(state.info["truncation"]), np.where(fell, 0, 1))
@@ -147,8 +152,8 @@ def test_boards_go_where_their_scenario_says(
     fleet: Any, closed_loop: list[Any], walked: Any
 ) -> None:
     """Every env its own way, to the servos' lag of 10 ms, which is 0.035 deg at 3.5 deg/s."""
-    scenario = closed_loop[0].info["scenario"]
-    qpos = np.asarray([state.pipeline_state.qpos for state in closed_loop])
+    scenario = closed_loop[0].pipeline_state.scenario
+    qpos = np.asarray([state.pipeline_state.physics.qpos for state in closed_loop])
     board = np.degrees(qpos[:, :, fleet.env.scene.board_qpos])
     for number in range(EPISODE + 1):
         expected = [
@@ -174,9 +179,10 @@ def test_who_diverges_falls_alone(fleet: Any, closed_loop: list[Any], value: flo
     before = closed_loop[20]
     info = {name: part for name, part in before.info.items() if name != "action"}
     before, actions = before.replace(info=info), closed_loop[21].info["action"]
-    qvel = before.pipeline_state.qvel.copy()
+    qvel = before.pipeline_state.physics.qvel.copy()
     qvel[3, 11] = value
-    spoilt = before.replace(pipeline_state=before.pipeline_state._replace(qvel=qvel))
+    physics = before.pipeline_state.physics._replace(qvel=qvel)
+    spoilt = with_state(before, physics=physics)
     clean, got = (jax.device_get(fleet.step(state, actions)) for state in (before, spoilt))
     others = np.arange(ENVS) != 3
 
@@ -186,7 +192,7 @@ def test_who_diverges_falls_alone(fleet: Any, closed_loop: list[Any], value: flo
     jax.tree.map(check, clean, got)
     assert got.done[3] == got.metrics["fall"][3] == got.metrics["diverged"][3] == 1
     assert got.info["truncation"][3] == 0
-    for array in (got.obs, got.reward, *jax.tree.leaves(got.metrics), *got.info["memory"]):
+    for array in (got.obs, got.reward, *jax.tree.leaves(got.metrics), *got.pipeline_state.memory):
         assert np.isfinite(array).all()
     assert got.metrics["tilt_deg"][3] == 6
     toward = max((before.metrics["tilt_deg"][3] - 6) / 2.5, -1)
@@ -201,7 +207,7 @@ def scenarios(config: Config, seconds: float, square_share: float) -> Any:
         config.task, episode_length=round(seconds / 0.2), square_share=square_share
     )
     env = BalanceEnv(dataclasses.replace(config, task=task))
-    draw = jax.jit(jax.vmap(lambda key: env.reset(key).info["scenario"]))
+    draw = jax.jit(jax.vmap(lambda key: env.reset(key).pipeline_state.scenario))
     return jax.device_get(draw(jax.random.split(jax.random.PRNGKey(0), RESETS)))
 
 

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from fixtures.fleet import with_state
 
 from mjx_balance.config import RandomizationConfig, preset
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.task.observation import observation_names
-from mjx_balance.task.randomization import Conditions
+from mjx_balance.task.randomization import DomainParams
 
 MANY = 4_000
 ENVS, STAND = 32, 220
@@ -22,17 +23,17 @@ KICKED = (13, 25, 38)
 
 
 @pytest.fixture(scope="module")
-def drawn(fleet: Any) -> tuple[Conditions, Any, np.ndarray]:
+def drawn(fleet: Any) -> tuple[DomainParams, Any, np.ndarray]:
     """Circumstances, scenarios and kicks of many resets."""
 
     def draw(key: jax.Array) -> Any:
-        info = fleet.env.reset(key).info
-        return info["conditions"], info["scenario"], info["kicks"]
+        state = fleet.env.reset(key).pipeline_state
+        return state.params, state.scenario, state.pushes.velocity
 
     return jax.device_get(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), MANY)))
 
 
-def test_circumstances_fill_their_ranges(drawn: tuple[Conditions, Any, np.ndarray]) -> None:
+def test_circumstances_fill_their_ranges(drawn: tuple[DomainParams, Any, np.ndarray]) -> None:
     conditions, _, kicks = drawn
     ranges = {
         "payload": (conditions.payload, 0, 5),
@@ -48,13 +49,13 @@ def test_circumstances_fill_their_ranges(drawn: tuple[Conditions, Any, np.ndarra
         test = scipy.stats.kstest(values, "uniform", (low, high - low))
         assert test.pvalue > 1e-3, name
     np.testing.assert_allclose(conditions.payload_at[:, 2], 0.08, rtol=1e-6)
-    assert set(conditions.latency) == {0, 1}
-    assert conditions.latency.mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(MANY))
+    assert set(conditions.delay) == {0, 1}
+    assert conditions.delay.mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(MANY))
     sigma = np.asarray([0.002] * 3 + [0.023] * 3, np.float32)
     np.testing.assert_allclose(conditions.imu_noise, np.tile(sigma, (MANY, 1)))
 
 
-def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any, np.ndarray]) -> None:
+def test_no_two_draws_of_an_env_go_together(drawn: tuple[DomainParams, Any, np.ndarray]) -> None:
     """A key used twice would tie a payload to a target."""
     conditions, scenario, kicks = drawn
     columns = np.column_stack(
@@ -63,7 +64,7 @@ def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any, np.nda
             conditions.payload_at[:, :2],
             conditions.friction,
             conditions.gain,
-            conditions.latency,
+            conditions.delay,
             scenario.targets[:, 1],
             np.linalg.norm(scenario.targets[:, 1], axis=-1),
             scenario.phase,
@@ -77,25 +78,29 @@ def test_no_two_draws_of_an_env_go_together(drawn: tuple[Conditions, Any, np.nda
 def test_a_kick_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: Any) -> None:
     """On level boards, robots given that velocity by hand move alike, whatever the decision."""
     start = fleet.level(fleet.under(fleet.reset(fleet.keys(5)), fleet.nominal()))
-    kicks, physics = np.asarray(start.info["kicks"]), start.pipeline_state
+    kicks, physics = np.asarray(start.pipeline_state.pushes.velocity), start.pipeline_state.physics
     free = fleet.env.scene.model.jnt_dofadr[fleet.env.scene.model.joint("robot/root").id]
 
     def after(decision: int, velocity: np.ndarray) -> Any:
-        info = start.info | {"decision": jnp.full(ENVS, decision, jnp.int32)}
+        env_steps = jnp.full(ENVS, decision, jnp.int32)
         given = physics._replace(qvel=physics.qvel.at[:, free : free + 2].add(velocity))
-        state = fleet.step(start.replace(info=info, pipeline_state=given), np.full(ENVS, STAND))
+        state = fleet.step(
+            with_state(start, env_steps=env_steps, physics=given), np.full(ENVS, STAND)
+        )
         return jax.device_get(state)
 
     none, still = np.zeros((ENVS, 2)), after(1, np.zeros((ENVS, 2)))
     for decision in (0, 12, 14, 24, 26, 49):
-        imu = after(decision, none).info["memory"].imu
-        np.testing.assert_allclose(imu, still.info["memory"].imu, atol=1e-3)
+        imu = after(decision, none).pipeline_state.memory.imu
+        np.testing.assert_allclose(imu, still.pipeline_state.memory.imu, atol=1e-3)
     for k, decision in enumerate(KICKED):
         kicked, by_hand = after(decision, none), after(1, kicks[:, k])
         for name in ("qpos", "qvel"):
-            ours, theirs = (getattr(s.pipeline_state, name) for s in (kicked, by_hand))
+            ours, theirs = (getattr(s.pipeline_state.physics, name) for s in (kicked, by_hand))
             np.testing.assert_allclose(ours, theirs, atol=1e-4)
-        shaken = np.abs(kicked.info["memory"].imu - still.info["memory"].imu).max(axis=(1, 2))
+        shaken = np.abs(kicked.pipeline_state.memory.imu - still.pipeline_state.memory.imu).max(
+            axis=(1, 2)
+        )
         assert shaken.min() > 0.5, "m/s^2"
 
 
@@ -105,8 +110,8 @@ def test_pushes_change_no_other_draw(fleet: Any) -> None:
     calm = dataclasses.replace(config.randomization, push_min=0.0, push_max=0.0)
     env = BalanceEnv(dataclasses.replace(config, randomization=calm))
     ours, theirs = (jax.jit(e.reset)(jax.random.PRNGKey(7)) for e in (fleet.env, env))
-    info = {name: value for name, value in ours.info.items() if name != "kicks"}
-    jax.tree.map(np.testing.assert_array_equal, info, theirs.info)
+    ours = with_state(ours, pushes=None)
+    jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
 def test_nobody_is_kicked_unless_asked_for() -> None:
@@ -114,7 +119,8 @@ def test_nobody_is_kicked_unless_asked_for() -> None:
     late = RandomizationConfig(push_max=0.2, push_period=60.0)
     for random in (RandomizationConfig(), late):
         env = BalanceEnv(dataclasses.replace(preset("default"), randomization=random))
-        assert "kicks" not in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).info
+        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
+        assert state.pushes is None
 
 
 SIGMA = np.linspace(0.5, 2, ENVS)[:, None] * np.asarray((0.001, 0.002, 0.003, 0.02, 0.04, 0.06))
@@ -133,7 +139,7 @@ def noise(fleet: Any) -> tuple[np.ndarray, list[Any], list[Any]]:
             states.append(jax.device_get(state))
         runs.append(states)
     clean, noisy = runs
-    imu = [np.asarray([s.info["memory"].imu for s in states], float) for states in runs]
+    imu = [np.asarray([s.pipeline_state.memory.imu for s in states], float) for states in runs]
     return (imu[1] - imu[0]) / SIGMA[:, None], clean, noisy
 
 
@@ -169,13 +175,15 @@ def test_noise_is_seen_and_moves_nobody(fleet: Any, noise: Any) -> None:
     _, clean, noisy = noise
     names = np.asarray(observation_names(fleet.env.config.task, fleet.env.scene.robot))
     for a, b in zip(clean, noisy, strict=True):
-        jax.tree.map(np.testing.assert_array_equal, a.pipeline_state, b.pipeline_state)
+        jax.tree.map(
+            np.testing.assert_array_equal, a.pipeline_state.physics, b.pipeline_state.physics
+        )
         np.testing.assert_array_equal(a.reward, b.reward)
         difference = b.obs - a.obs
         heights = np.char.startswith(names, "H_") | np.char.startswith(names, "C_")
         np.testing.assert_array_equal(difference[:, heights], 0 * difference[:, heights])
         # The newest five samples of the roll rate, in deg/s.
-        rate = (b.info["memory"].imu - a.info["memory"].imu)[:, -5:, 0].mean(axis=1)
+        rate = (b.pipeline_state.memory.imu - a.pipeline_state.memory.imu)[:, -5:, 0].mean(axis=1)
         entry = list(names).index("V_x,t-0")
         np.testing.assert_allclose(difference[:, entry], np.degrees(rate), atol=1e-4)
 
@@ -183,14 +191,18 @@ def test_noise_is_seen_and_moves_nobody(fleet: Any, noise: Any) -> None:
 def test_envs_of_a_batch_move_in_their_own_circumstances(fleet: Any) -> None:
     """Two payloads, gains and soles under one scenario: each is where it is alone."""
     state = fleet.reset(fleet.keys(9))
-    drawn = jax.device_get(state.info["conditions"])
+    drawn = jax.device_get(state.pipeline_state.params)
     turned = [np.roll(x, 1, axis=0) for x in drawn]
-    scenario = jax.tree.map(lambda x: np.repeat(np.asarray(x)[:1], ENVS, 0), state.info["scenario"])
-    state = state.replace(info=state.info | {"scenario": scenario})
+    scenario = jax.tree.map(
+        lambda x: np.repeat(np.asarray(x)[:1], ENVS, 0), state.pipeline_state.scenario
+    )
+    state = with_state(state, scenario=scenario)
     actions = np.full(ENVS, STAND + 42)
     first, second = (
-        jax.device_get(fleet.step(fleet.under(state, conditions), actions)).pipeline_state.qpos
-        for conditions in (drawn, Conditions(*turned))
+        jax.device_get(
+            fleet.step(fleet.under(state, conditions), actions)
+        ).pipeline_state.physics.qpos
+        for conditions in (drawn, DomainParams(*turned))
     )
     np.testing.assert_allclose(np.roll(first, 1, axis=0), second, atol=1e-6)
     height = first[:, fleet.env.scene.trunk_quat[0] - 1]

@@ -23,13 +23,13 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.envs.batch import Boards
+from mjx_balance.envs.batch import BatchEnv, Episodes, draw_episodes
 from mjx_balance.envs.gym import BalanceGymEnv, BalanceVecEnv
-from mjx_balance.envs.registration import _AfterGymnasium
 from mjx_balance.evaluation.controllers import View
 from mjx_balance.evaluation.rollout import roll_out
 from mjx_balance.render import drawing as render
 from mjx_balance.render.drawing import RenderError
+from mjx_balance.robots.catalogue import Robot
 
 ENV = "mjx_balance/Balance-v0"
 STAND, LEFT_UP = 220, 20 * 21 + 10
@@ -120,14 +120,14 @@ def test_gymnasium_finds_nothing_to_warn_of(kind: str, screen: list[Screen]) -> 
 
 
 @pytest.mark.slow
-def test_the_package_is_enough_and_imports_no_gymnasium() -> None:
-    """Whichever is imported first, and though somebody has only looked whether there is one."""
-    make = f"gymnasium.make({ENV!r}).unwrapped, gymnasium.make_vec({ENV!r})"
-    for lines in (
-        "import gymnasium, mjx_balance",
-        "import sys, mjx_balance; assert 'gymnasium' not in sys.modules; import gymnasium",
-        "import mjx_balance, importlib.util as u; u.find_spec('gymnasium'); import gymnasium",
+def test_the_package_is_enough_whichever_is_imported_first() -> None:
+    """A process that has imported neither, as a spawned worker, names the module in the id."""
+    for lines, env_id in (
+        ("import gymnasium, mjx_balance", ENV),
+        ("import mjx_balance; import gymnasium", ENV),
+        ("import gymnasium", f"mjx_balance:{ENV}"),
     ):
+        make = f"gymnasium.make({env_id!r}).unwrapped, gymnasium.make_vec({env_id!r})"
         said = f"import sys; {lines}; print({make}, 'jax' in sys.modules)"
         done = subprocess.run(
             [sys.executable, "-W", "error", "-c", said], capture_output=True, text=True
@@ -147,10 +147,6 @@ def test_a_broken_gymnasium_says_so_itself(tmp_path: Path) -> None:
     assert done.stderr.strip().endswith("RuntimeError: broken")
 
 
-def test_no_gymnasium_is_found_where_there_is_none(tmp_path: Path) -> None:
-    assert _AfterGymnasium().find_spec("gymnasium", [str(tmp_path)]) is None
-
-
 def test_equal_seeds_equal_episodes(env: Any) -> None:
     actions = random_actions(0, 40)
     first, again, other = (walk(env, actions, seed) for seed in (4, 4, 5))
@@ -163,21 +159,19 @@ def test_equal_seeds_equal_episodes(env: Any) -> None:
     assert np.abs(env.step(STAND)[0] - first[1][0]).max() > 1e-6, "no episode comes twice"
 
 
-def driven(config: Config, boards: Boards, actions: np.ndarray) -> list[Any]:
-    """States of `BalanceEnv` in the scenario and circumstances of a board."""
+def driven(config: Config, batch: BatchEnv, actions: np.ndarray) -> list[Any]:
+    """States of `BalanceEnv` in the episode of a batch's only env."""
     env = BalanceEnv(config)
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     state: Any = reset(jax.random.PRNGKey(0))
-
-    def of_board(value: np.ndarray) -> jax.Array:
-        return jnp.asarray(value[0], jnp.float32)
-
-    info = {"scenario": jax.tree.map(of_board, boards.scenario)}
-    if "conditions" in state.info:
-        info["conditions"] = jax.tree.map(of_board, boards.conditions)
-        info["kicks"] = of_board(boards.pushes.kicks)
-    state = state.replace(info=state.info | info)
-    states = [state]
+    start, theirs = state.pipeline_state, batch.state
+    given = {name: getattr(theirs, name) for name in ("scenario", "params", "pushes")}
+    given = jax.tree.map(
+        lambda x, own: jnp.asarray(x[0], own.dtype),
+        given,
+        {name: getattr(start, name) for name in given},
+    )
+    states = [state.replace(pipeline_state=start._replace(**given))]
     for action in actions:
         states.append(step(states[-1], jnp.int32(action)))
     return jax.device_get(states)
@@ -191,12 +185,13 @@ def test_an_episode_is_that_of_balance_env(
     """Between decisions its state is float32: 6e-8 of an IMU in units of 1 deg comes to 1e-4."""
     config = dataclasses.replace(short(config, 40), engine="mujoco", randomization=ranges)
     env = BalanceGymEnv(config=config)
-    latency = []
+    delays = []
     for seed in (1, 2):
         actions = np.full(40, LEFT_UP) if falls else random_actions(seed, 40, 1)
         seen = walk(env, actions, seed)
-        latency.append(env.boards.conditions.latency[0])
-        states = driven(config, env.boards, actions[: len(seen) - 1])
+        params = env.batch.state.params
+        delays.append(0 if params is None else params.delay[0])
+        states = driven(config, env.batch, actions[: len(seen) - 1])
         assert 5 < len(seen) < 12 if falls else len(seen) == 41
         assert seen[-1][2:4] == (falls, not falls)
         for step, state in zip(seen, states, strict=True):
@@ -207,7 +202,7 @@ def test_an_episode_is_that_of_balance_env(
             assert fell == info["fall"] == bool(state.metrics["fall"])
             assert late == bool(state.info["truncation"])
             assert (fell or late) == bool(state.done)
-    assert set(latency) == ({0, 1} if ranges == RANDOM else {0})
+    assert set(delays) == ({0, 1} if ranges == RANDOM else {0})
 
 
 def test_every_sample_has_noise_of_its_own(config: Config) -> None:
@@ -228,10 +223,12 @@ def test_every_sample_has_noise_of_its_own(config: Config) -> None:
 
 
 @pytest.mark.parametrize(("share", "square"), [(0.0, 49 / 6), (1.0, 49 / 3), (0.5, 49 / 4)])
-def test_boards_are_those_of_training(config: Config, share: float, square: float) -> None:
-    boards = Boards(short(config, 300, square_share=share), 1500)
-    boards.start(np.arange(1500), [np.random.default_rng(k) for k in range(1500)])
-    targets, phase, rate = boards.scenario
+def test_boards_are_those_of_training(
+    config: Config, robot: Robot, share: float, square: float
+) -> None:
+    rngs = [np.random.default_rng(k) for k in range(1500)]
+    own = short(config, 300, square_share=share)
+    targets, phase, rate = draw_episodes(own, robot, rngs).scenario
     assert targets.shape == (1500, 7, 2)  # 60 s, whatever the phase
     assert not targets[:, 0].any()
     # x^2 of a disc's uniform radius of 7 deg: 49 / 3 / 2; of a square's side: 49 / 3.
@@ -255,9 +252,9 @@ def test_an_episode_is_that_of_the_evaluation(config: Config, falls: bool) -> No
 
     def recorded(view: View) -> np.ndarray:
         asked.append(view.obs[0])
-        return actions[[view.decision]]
+        return actions[[view.env_steps]]
 
-    rollout = roll_out(env.boards.scene, recorded, env.boards.scenario, 12.0)
+    rollout = roll_out(env.scene, recorded, Episodes(env.batch.state.scenario), 12.0)
     assert falls == rollout.fell[0] == seen[-1][2]
     np.testing.assert_array_equal([s[0] for s in seen[:-1]], np.asarray(asked, np.float32))
     tilt = rollout.tilt.reshape(60, 50).mean(axis=-1)[: len(seen) - 1]
@@ -284,7 +281,7 @@ def test_a_fall_at_the_time_limit_is_a_fall(config: Config) -> None:
     late = BalanceGymEnv(config=short(config, ends))
     # Targets of shorter episodes are fewer: the same board is given.
     late.reset(seed=0)
-    late.boards.scenario = env.boards.scenario
+    late.batch.state = late.batch.state._replace(scenario=env.batch.state.scenario)
     seen = [late.step(LEFT_UP) for _ in range(ends)]
     assert seen[-1][2:4] == (True, False)
 
@@ -293,7 +290,7 @@ def test_a_simulation_that_mujoco_has_stopped_is_a_fall() -> None:
     """Its state stays sane; MuJoCo's warning alone says it. A reset takes the warning back."""
     envs = BalanceVecEnv(2)
     envs.reset(seed=0)
-    envs.boards._engine._batch.warning[1] = 1
+    envs.batch._engine._batch.warning[1] = 1
     seen = [envs.step(np.full(2, STAND)) for _ in range(3)]
     assert [list(step[2]) for step in seen] == [[False, True], [False, False], [False, False]]
     assert seen[0][4]["final_info"]["tilt_deg"][1] == 6
@@ -378,7 +375,7 @@ def test_a_diverged_board_falls_alone(config: Config) -> None:
     for envs in (clean, spoilt):
         envs.reset(seed=1)
         envs.step(actions)
-    spoilt.boards._engine._batch.qvel[2, 11] = np.nan
+    spoilt.batch._engine._batch.qvel[2, 11] = np.nan
     wanted, got = clean.step(actions), spoilt.step(actions)
     others = np.arange(4) != 2
     for a, b in zip(got[:4], wanted[:4], strict=True):
@@ -414,11 +411,11 @@ def test_continuous_actions_are_shares_of_the_greatest(config: Config) -> None:
 @pytest.mark.parametrize("bad", [441, -1, 2.0, "up", None, [220], np.nan])
 def test_another_action_is_refused(env: Any, bad: Any) -> None:
     env.reset(seed=0)
-    before = env.unwrapped.boards.qpos
+    before = env.unwrapped.batch.qpos
     with pytest.raises(InvalidAction) as said:
         env.step(bad)
     assert str(said.value) == f"action is {bad!r}; it must be in Discrete(441)"
-    np.testing.assert_array_equal(env.unwrapped.boards.qpos, before)
+    np.testing.assert_array_equal(env.unwrapped.batch.qpos, before)
 
 
 @pytest.mark.parametrize("bad", [[1.1, 0], [np.nan, 0], [1e300, 0], [0], 0.5, "up", [[0, 0]]])
@@ -507,12 +504,12 @@ def test_seeds_may_come_as_an_array() -> None:
     seen = []
     for seed in ([7, 8, 9, 10], np.arange(7, 11), np.int64(7), list(np.arange(7, 11))):
         envs.reset(seed=seed)
-        seen.append(envs.boards.scenario.targets.copy())
+        seen.append(envs.batch.state.scenario.targets.copy())
     for targets in seen[1:]:
         np.testing.assert_array_equal(targets, seen[0])
     single = BalanceGymEnv()
     single.reset(seed=9)
-    np.testing.assert_array_equal(seen[0][2], single.boards.scenario.targets[0])
+    np.testing.assert_array_equal(seen[0][2], single.batch.state.scenario.targets[0])
     for bad in (2.5, "3", [[1, 2, 3, 4]], {}):
         with pytest.raises(ValueError, match="it must be a whole number, or one or None for each"):
             envs.reset(seed=bad)
@@ -527,17 +524,17 @@ def test_options_are_refused_before_anything_starts_anew() -> None:
     for env in (BalanceGymEnv(), BalanceVecEnv(2)):
         env.reset(seed=0, options={})
         env.step(np.full(env.action_space.shape, STAND)[()])
-        before = env.boards.qpos.copy()
+        before = env.batch.qpos.copy()
         with pytest.raises(ValueError, match=r"options is {'reset_mask': .*; it must be None or"):
             env.reset(options=mask)
-        np.testing.assert_array_equal(env.boards.qpos, before)
+        np.testing.assert_array_equal(env.batch.qpos, before)
 
 
 @pytest.mark.parametrize("kind", [BalanceGymEnv, BalanceVecEnv])
 def test_another_robot_brings_its_size(kind: Any) -> None:
     """A B2's: 3 mm by its lever, 0.329 m over our 0.193; loads by its mass, 83.5 kg over 15.2."""
     env = kind(preset="best", robot="b2", action="continuous")
-    config = env.boards.config
+    config = env.config
     assert (config.robot, config.task.body_height) == ("b2", 0.571)
     assert config.task.action_max == pytest.approx(0.003 * 0.329 / 0.193, rel=2e-3)
     assert config.randomization.payload == pytest.approx(5 * 83.5 / 15.2, rel=2e-3)
@@ -596,7 +593,7 @@ def test_a_window_plays_every_decision_at_real_speed(
         env.step(STAND)
     assert len(window.shown) == 26, "25 a second"
     assert clock[0] - began == pytest.approx(1.0, abs=0.05)
-    np.testing.assert_array_equal(window.shown[-1], env.boards.qpos[0])
+    np.testing.assert_array_equal(window.shown[-1], env.batch.qpos[0])
     window.open = False  # its user has closed it
     env.step(STAND)
     assert len(window.shown) == 26

@@ -22,7 +22,8 @@ from mjx_balance.evaluation.controllers import (
     make_controller,
     measure_response,
 )
-from mjx_balance.evaluation.rollout import run_suite, summarize
+from mjx_balance.evaluation.rollout import run_suite
+from mjx_balance.evaluation.summary import summarize
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.actions import action_table

@@ -16,27 +16,26 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config
-from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.envs.batch import BatchEnv, Episodes
+from mjx_balance.evaluation import envelope as envelope_module
 from mjx_balance.evaluation.controllers import View
+from mjx_balance.evaluation.envelope import Envelope, envelope
 from mjx_balance.evaluation.rollout import (
-    Envelope,
     EvaluationError,
     Rollout,
-    envelope,
     evaluate,
     observing,
     roll_out,
     run_suite,
-    settled_action,
-    summarize,
 )
-from mjx_balance.evaluation.suites import SuiteError, make_scenarios
+from mjx_balance.evaluation.suites import SuiteError, draw_suite
+from mjx_balance.evaluation.summary import settled_action, summarize
 from mjx_balance.policy.file import save_policy
 from mjx_balance.policy.manifest import PolicyError, make_manifest
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.observation import observation_names
 from mjx_balance.task.pushes import Pushes
-from mjx_balance.task.randomization import Conditions
+from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.tilt import Scenario
 
 STAND, LEFT_UP = 220, 20 * 21 + 10
@@ -47,7 +46,7 @@ def always(action: int):
 
 
 def draw(config: Config, suite: str, count: int, duration: float, seed: int) -> Scenario:
-    return make_scenarios(config, suite, count, duration, seed)[0]
+    return draw_suite(config, suite, count, duration, seed).scenario
 
 
 @pytest.fixture(scope="session")
@@ -70,15 +69,15 @@ def level_boards(config: Config, count: int, duration: float) -> Scenario:
     return scenarios._replace(targets=0 * scenarios.targets)
 
 
-def nominal(count: int) -> Conditions:
+def nominal(count: int) -> DomainParams:
     """Circumstances that change nothing."""
-    return Conditions(
+    return DomainParams(
         imu_noise=np.zeros((count, 6)),
         payload=np.zeros(count),
         payload_at=np.zeros((count, 3)),
         friction=np.full(count, 0.8),
         gain=np.ones(count),
-        latency=np.zeros(count),
+        delay=np.zeros(count),
     )
 
 
@@ -173,22 +172,22 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
         payload=np.asarray((0.0, 3.0)),
         payload_at=np.asarray([(0, 0, 0), (0, 0, 0.1)]),
         gain=np.asarray((1.0, 0.85)),
-        latency=np.asarray((0.0, 1.0)),
+        delay=np.asarray((0.0, 1.0)),
     )
     worlds = [ByHand(scene, 1.0, 0.0, 0.0, False), ByHand(scene, 0.85, 3.0, 0.1, True)]
     actions = np.random.default_rng(1).integers(0, 441, (6, 2))
 
     def act(view: View) -> np.ndarray:
-        assert view.late.tolist() == [False, True]
+        assert view.delayed.tolist() == [False, True]
         for k, world in enumerate(worlds):
             np.testing.assert_allclose(view.obs[k], world.observation(scene.config), atol=1e-6)
             np.testing.assert_allclose(view.imu[k], world.imu[-50:], atol=1e-7)
             np.testing.assert_allclose(view.qpos[k], world.data.qpos, atol=1e-9)
             np.testing.assert_allclose(view.qvel[k], world.data.qvel, atol=1e-8)
-            world.decide(actions[view.decision, k], targets[k, 0], (3.5, 2.0)[k])
-        return actions[view.decision]
+            world.decide(actions[view.env_steps, k], targets[k, 0], (3.5, 2.0)[k])
+        return actions[view.env_steps]
 
-    rollout = roll_out(scene, act, scenarios, 1.2, record=True, conditions=conditions)
+    rollout = roll_out(scene, act, Episodes(scenarios, conditions), 1.2, record=True)
     assert rollout.qpos is not None
     expected = np.asarray([world.qpos for world in worlds])
     np.testing.assert_allclose(rollout.qpos, expected, atol=1e-9)
@@ -217,13 +216,13 @@ def test_kicks_come_between_a_choice_and_its_decision(config: Config, scene: Sce
             np.testing.assert_allclose(view.obs[k], world.observation(config), atol=1e-6)
             np.testing.assert_allclose(view.imu[k], world.imu[-50:], atol=1e-7)
             np.testing.assert_allclose(view.qvel[k], world.data.qvel, atol=1e-8)
-            if view.decision in (1, 4):
-                world.data.qvel[free : free + 2] += kicks[k, (1, 4).index(view.decision)]
-            world.decide(actions[view.decision, k], targets[k, 0], 3.5)
-        return actions[view.decision]
+            if view.env_steps in (1, 4):
+                world.data.qvel[free : free + 2] += kicks[k, (1, 4).index(view.env_steps)]
+            world.decide(actions[view.env_steps, k], targets[k, 0], 3.5)
+        return actions[view.env_steps]
 
-    pushes = Pushes(kicks, np.asarray((1, 4)))
-    rollout = roll_out(scene, act, scenarios, 1.2, record=True, pushes=pushes)
+    pushes = Pushes(kicks, np.asarray([(1, 4), (1, 4)]))
+    rollout = roll_out(scene, act, Episodes(scenarios, pushes=pushes), 1.2, record=True)
     assert not rollout.fell.any()
     assert rollout.qpos is not None
     np.testing.assert_allclose(rollout.qpos, [world.qpos for world in worlds], atol=1e-9)
@@ -232,17 +231,16 @@ def test_kicks_come_between_a_choice_and_its_decision(config: Config, scene: Sce
 def test_who_stands_gets_its_own_kick_when_others_have_fallen(config: Config, scene: Scene) -> None:
     """World 0 falls within 1.2 s; the kick after 2 s moves world 1 as it does alone."""
     scenarios = level_boards(config, 2, 3.0)
-    kicks, at = np.asarray([[(0.3, 0.0)], [(0.0, -0.25)]]), np.asarray((10,))
+    kicks, at = np.asarray([[(0.3, 0.0)], [(0.0, -0.25)]]), np.asarray([(10,), (10,)])
     both = roll_out(
         scene,
         lambda view: np.where(view.ids == 0, LEFT_UP, STAND),
-        scenarios,
+        Episodes(scenarios, pushes=Pushes(kicks, at)),
         3.0,
-        pushes=Pushes(kicks, at),
     )
     assert both.fell.tolist() == [True, False]
     one = Scenario(*(x[1:] for x in scenarios))
-    alone = roll_out(scene, always(STAND), one, 3.0, pushes=Pushes(kicks[1:], at))
+    alone = roll_out(scene, always(STAND), Episodes(one, pushes=Pushes(kicks[1:], at[1:])), 3.0)
     np.testing.assert_allclose(both.tilt[1], alone.tilt[0], atol=1e-9)
     assert alone.tilt[0, :500].max() < 0.05 < 0.3 < alone.tilt[0, 500:].max()
 
@@ -269,7 +267,7 @@ def test_tilt_counts_six_from_the_very_step_of_the_fall(config: Config, scene: S
     """Against the recorded attitudes: the first step beyond 6 deg, of one world of three."""
     scenarios = level_boards(config, 3, 3.0)
     actions = np.asarray((STAND, LEFT_UP, STAND))
-    rollout = roll_out(scene, lambda view: actions[view.ids], scenarios, 3.0, record=True)
+    rollout = roll_out(scene, lambda view: actions[view.ids], Episodes(scenarios), 3.0, record=True)
     assert rollout.qpos is not None
     quat = rollout.qpos[1][:, scene.trunk_quat]
     up = Rotation.from_quat(quat, scalar_first=True).apply((0, 0, 1))[:, 2]
@@ -292,17 +290,17 @@ def test_tilt_counts_six_from_the_very_step_of_the_fall(config: Config, scene: S
 def test_who_fell_is_out_even_if_it_rights_itself(config: Config, scene: Scene) -> None:
     """One step overshoots by a little: a limit between its peak and its end ends the scenario."""
     scenarios = level_boards(config, 1, 1.0)
-    course = roll_out(scene, always(LEFT_UP), scenarios, 0.2).tilt[0]
+    course = roll_out(scene, always(LEFT_UP), Episodes(scenarios), 0.2).tilt[0]
     limit = float(course.max() + course[-1]) / 2
     assert course[-1] < limit < course.max()
     strict = dataclasses.replace(config, task=dataclasses.replace(config.task, fail_tilt=limit))
     calls = []
 
     def once(view: View) -> np.ndarray:
-        calls.append(view.decision)
-        return np.full(1, LEFT_UP if view.decision == 0 else STAND)
+        calls.append(view.env_steps)
+        return np.full(1, LEFT_UP if view.env_steps == 0 else STAND)
 
-    rollout = roll_out(dataclasses.replace(scene, config=strict), once, scenarios, 1.0)
+    rollout = roll_out(dataclasses.replace(scene, config=strict), once, Episodes(scenarios), 1.0)
     assert calls == [0]
     assert rollout.fell_at[0] == np.flatnonzero(course > limit)[0]
     assert (rollout.tilt[0, rollout.fell_at[0] :] == limit).all()
@@ -314,7 +312,7 @@ def test_the_standing_are_shown_their_own_world_when_others_have_fallen(
     """World 2 of three sees, and does, what it sees and does alone; world 1 falls."""
     drawn = draw(config, "corner", 3, 4.0, 1)
     conditions = nominal(3)._replace(
-        payload=np.asarray((0.0, 0.0, 2.0)), latency=np.asarray((0.0, 0.0, 1.0))
+        payload=np.asarray((0.0, 0.0, 2.0)), delay=np.asarray((0.0, 0.0, 1.0))
     )
     drawn = drawn._replace(targets=0.3 * drawn.targets)
     moves = np.random.default_rng(0).choice((STAND - 21, STAND - 1, STAND + 1, STAND + 21), 20)
@@ -328,15 +326,17 @@ def test_the_standing_are_shown_their_own_world_when_others_have_fallen(
             (row,) = np.flatnonzero(own == 2)
             seen[count].append((view.obs[row], view.imu[row], view.qpos[row], view.qvel[row]))
             assert (view.scenario.targets[row] == drawn.targets[2]).all()
-            assert view.late[row]
-            return np.choose(own, (STAND, LEFT_UP, moves[view.decision]))
+            assert view.delayed[row]
+            return np.choose(own, (STAND, LEFT_UP, moves[view.env_steps]))
 
         return roll_out(
             scene,
             act,
-            Scenario(*(x[first:] for x in drawn)),
+            Episodes(
+                Scenario(*(x[first:] for x in drawn)),
+                DomainParams(*(x[first:] for x in conditions)),
+            ),
             4.0,
-            conditions=Conditions(*(x[first:] for x in conditions)),
         )
 
     together, alone = run(0), run(2)
@@ -456,7 +456,8 @@ def test_cells_of_the_envelope_are_inclines_by_speeds(
     """A made-up world where a board falls beyond 8 deg or 5 deg/s, tilted by both."""
     asked = []
 
-    def roll(scene: Scene, controller: Any, drawn: Scenario, *_: Any, **__: Any):
+    def roll(scene: Scene, controller: Any, episodes: Episodes, *_: Any, **__: Any):
+        drawn = episodes.scenario
         asked.append((scene.config, drawn))
         incline, rate = np.abs(drawn.targets[:, 0, 0]), drawn.rate
         fell = (incline > 8) | (rate > 5)
@@ -465,7 +466,7 @@ def test_cells_of_the_envelope_are_inclines_by_speeds(
         tilt = np.tile((incline + rate / 100)[:, None], (1, 4))
         return Rollout(config.task, tilt, np.where(fell, 1, 4), np.zeros((len(fell), 1)), None, 1.0)
 
-    monkeypatch.setattr(evaluation, "roll_out", roll)
+    monkeypatch.setattr(envelope_module, "roll_out", roll)
     found = envelope(scene, always(STAND), 2, 12.0, 3)
     assert found.inclines == list(range(2, 13))
     assert found.rates == [2.5 + 0.25 * k for k in range(15)]
@@ -495,7 +496,7 @@ def test_duration_is_rounded_up_to_whole_decisions(
 ) -> None:
     done = []
     rollout = roll_out(
-        scene, always(STAND), level_boards(config, 1, 2.0), duration, progress=done.append
+        scene, always(STAND), Episodes(level_boards(config, 1, 2.0)), duration, progress=done.append
     )
     assert rollout.tilt.shape == (1, 50 * decisions)
     assert rollout.action_mm.shape == (1, decisions)
@@ -553,7 +554,7 @@ def test_suites_bring_their_circumstances(scene: Scene) -> None:
         told = []
 
         def act(view: View, told: list[bool] = told) -> np.ndarray:
-            told += view.late.tolist()
+            told += view.delayed.tolist()
             return np.full(len(view.ids), STAND)
 
         run_suite(scene, act, suite, 3, 0.2, 0)
@@ -583,7 +584,7 @@ def test_noise_of_a_world_does_not_depend_on_who_fell_before_it(scene: Scene) ->
 def test_standing_still_on_a_level_board_stays_level(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "paper", 2, 4.0, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)
-    rollout = roll_out(scene, always(STAND), level, 4.0)
+    rollout = roll_out(scene, always(STAND), Episodes(level), 4.0)
     assert not rollout.fell.any()
     assert rollout.tilt.max() < 0.05
     assert np.all(rollout.action_mm == 0)
@@ -592,7 +593,7 @@ def test_standing_still_on_a_level_board_stays_level(config: Config, scene: Scen
 def test_without_control_the_body_follows_the_board(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "paper", 1, 4.0, 0)
     held = scenarios._replace(targets=np.tile((3.0, 4.0), (1, scenarios.targets.shape[1], 1)))
-    rollout = roll_out(scene, always(STAND), held, 4.0)
+    rollout = roll_out(scene, always(STAND), Episodes(held), 4.0)
     assert not rollout.fell.any()
     assert rollout.tilt[0, -1] == pytest.approx(5.0, abs=0.3)
 
@@ -602,7 +603,7 @@ def test_raising_the_left_side_tilts_the_body_and_a_fall_counts_to_the_end(
 ) -> None:
     scenarios = draw(config, "paper", 3, 8.0, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)
-    rollout = roll_out(scene, always(LEFT_UP), level, 8.0)
+    rollout = roll_out(scene, always(LEFT_UP), Episodes(level), 8.0)
     assert rollout.fell.all()
     # 3 mm over a half-track of 142 mm is 1.2 deg a decision: 6 deg take 5 or 6 decisions.
     assert np.all((rollout.fell_at > 4 * 50) & (rollout.fell_at < 7 * 50))
@@ -620,15 +621,18 @@ def test_a_simulation_that_is_no_number_counts_as_a_fall(config: Config, scene: 
     scenarios = draw(config, "paper", 3, 1.0, 0)
     targets = 0 * scenarios.targets
     targets[1] = np.nan
-    rollout = roll_out(scene, always(STAND), scenarios._replace(targets=targets), 1.0)
+    rollout = roll_out(scene, always(STAND), Episodes(scenarios._replace(targets=targets)), 1.0)
     np.testing.assert_array_equal(rollout.fell, (False, True, False))
     assert np.isfinite(rollout.tilt).all()
 
 
 def test_one_thread_gives_what_many_give(config: Config, scene: Scene) -> None:
-    scenarios = draw(config, "corner", 5, 2.0, 0)
-    one, two = (roll_out(scene, always(STAND), scenarios, 2.0, n).tilt for n in (1, 2))
-    np.testing.assert_array_equal(one, two)
+    episodes = Episodes(draw(config, "corner", 5, 2.0, 0))
+    one, two = (BatchEnv(scene, episodes, threads) for threads in (1, 2))
+    for _ in range(5):
+        one.step(np.full((5, 2), 0.001))
+        two.step(np.full((5, 2), 0.001))
+        np.testing.assert_array_equal(one.path, two.path)
 
 
 @pytest.mark.parametrize(
@@ -680,8 +684,8 @@ def test_the_command_writes_the_contract_and_imports_no_jax(
 
 def test_nominal_conditions_change_nothing(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "corner", 3, 2.0, 0)
-    plain = roll_out(scene, always(LEFT_UP), scenarios, 2.0)
-    same = roll_out(scene, always(LEFT_UP), scenarios, 2.0, conditions=nominal(3))
+    plain = roll_out(scene, always(LEFT_UP), Episodes(scenarios), 2.0)
+    same = roll_out(scene, always(LEFT_UP), Episodes(scenarios, nominal(3)), 2.0)
     np.testing.assert_allclose(plain.tilt, same.tilt, atol=1e-6)
 
 
@@ -691,7 +695,7 @@ def test_a_payload_off_the_centre_bends_the_legs_under_it(config: Config, scene:
     loaded = nominal(2)._replace(
         payload=np.asarray((0.0, 5.0)), payload_at=np.asarray(((0.0, 0, 0), (0.1, 0, 0.1)))
     )
-    rollout = roll_out(scene, always(STAND), level, 2.0, conditions=loaded, record=True)
+    rollout = roll_out(scene, always(STAND), Episodes(level, loaded), 2.0, record=True)
     assert rollout.qpos is not None
     height = rollout.qpos[:, -1, scene.trunk_quat[0] - 1]
     assert rollout.tilt[0, -1] < 0.05 < rollout.tilt[1, -1]
@@ -702,7 +706,7 @@ def test_weak_servos_sag(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "paper", 2, 2.0, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)
     weak = nominal(2)._replace(gain=np.asarray((1.0, 0.8)))
-    rollout = roll_out(scene, always(STAND), level, 2.0, conditions=weak, record=True)
+    rollout = roll_out(scene, always(STAND), Episodes(level, weak), 2.0, record=True)
     assert rollout.qpos is not None
     height = rollout.qpos[:, -1, scene.trunk_quat[0] - 1]
     assert height[1] < height[0] - 5e-4
@@ -713,7 +717,7 @@ def test_feet_slide_where_friction_is_low(config: Config, scene: Scene) -> None:
     held = draw(config, "paper", 2, 4.0, 0)
     held = held._replace(targets=np.tile((0.0, 4.5), (2, held.targets.shape[1], 1)))
     icy = nominal(2)._replace(friction=np.asarray((0.4, 0.05)))
-    rollout = roll_out(scene, always(STAND), held, 4.0, conditions=icy, record=True)
+    rollout = roll_out(scene, always(STAND), Episodes(held, icy), 4.0, record=True)
     assert rollout.qpos is not None
     x = np.abs(rollout.qpos[:, -1, scene.trunk_quat[0] - 3])
     assert x[0] < 0.05 < x[1]
@@ -722,8 +726,8 @@ def test_feet_slide_where_friction_is_low(config: Config, scene: Scene) -> None:
 def test_late_actions_arrive_one_decision_late(config: Config, scene: Scene) -> None:
     scenarios = draw(config, "paper", 2, 0.6, 0)
     level = scenarios._replace(targets=0 * scenarios.targets)
-    late = nominal(2)._replace(latency=np.asarray((0.0, 1.0)))
-    rollout = roll_out(scene, always(LEFT_UP), level, 0.6, conditions=late)
+    late = nominal(2)._replace(delay=np.asarray((0.0, 1.0)))
+    rollout = roll_out(scene, always(LEFT_UP), Episodes(level, late), 0.6)
     prompt, delayed = rollout.tilt
     assert prompt[45] > 1.0 > 0.05 > delayed[45]
     np.testing.assert_allclose(delayed[50:], prompt[:100], atol=0.03)
@@ -741,7 +745,7 @@ def test_imu_noise_has_the_size_asked_for_and_is_seen_by_the_controller(
         seen.append(view)
         return np.full(len(view.ids), STAND)
 
-    roll_out(scene, watch, level, 1.0, conditions=noisy)
+    roll_out(scene, watch, Episodes(level, noisy), 1.0)
     imu = seen[-1].imu
     assert imu.shape == (40, 50, 6)
     np.testing.assert_allclose(imu[..., :3].std(), 0.002, rtol=0.05)

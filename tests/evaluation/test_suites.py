@@ -2,21 +2,22 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 
-from mjx_balance.config import Config, preset
+from mjx_balance.config import Config, RandomizationConfig, preset
+from mjx_balance.envs.batch import Episodes, rows
 from mjx_balance.evaluation.suites import (
     SEEDS,
     SUITES,
     SuiteError,
+    draw_suite,
     find_suite,
-    make_pushes,
-    make_scenarios,
 )
-from mjx_balance.robots.catalogue import Robot
+from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
-from mjx_balance.task.randomization import DRAWS
+from mjx_balance.task.randomization import DRAWS, draw_params
 
 
 def with_task(config: Config, **values: float) -> Config:
@@ -31,16 +32,16 @@ def draws(seed: int, k: int, targets: int = 7) -> tuple[np.ndarray, np.ndarray]:
 
 def test_scenarios_depend_on_the_seed_and_not_on_their_number(config: Config) -> None:
     for suite in SUITES:
-        few, many = (make_scenarios(config, suite, n, 60, 3) for n in (2, 5))
-        for short, long in zip((*few[0], *few[1]), (*many[0], *many[1]), strict=True):
-            np.testing.assert_array_equal(short, long[:2])
-    seeds = [make_scenarios(config, "paper", 5, 60, n)[0].targets for n in range(4)]
+        few, many = (draw_suite(config, suite, n, 60, 3) for n in (2, 5))
+        many = Episodes(*(rows(part, np.arange(2)) for part in many[:3]))
+        jax.tree.map(np.testing.assert_array_equal, few[:3], many[:3])
+    seeds = [draw_suite(config, "paper", 5, 60, n).scenario.targets for n in range(4)]
     assert len(np.unique(np.concatenate(seeds)[:, 0], axis=0)) == 20, "no two are alike"
 
 
 def test_every_target_of_paper_and_corner_by_its_draw(config: Config) -> None:
     """60 s need 7 targets. Published figures hold for these scenarios and no others."""
-    paper, corner = (make_scenarios(config, name, 3, 60.0, 5)[0] for name in ("paper", "corner"))
+    paper, corner = (draw_suite(config, name, 3, 60.0, 5).scenario for name in ("paper", "corner"))
     assert paper.targets.shape == corner.targets.shape == (3, 7, 2)
     for k in range(3):
         uniform, _ = draws(5, k)
@@ -56,7 +57,7 @@ def test_every_target_of_paper_and_corner_by_its_draw(config: Config) -> None:
 def test_circumstances_by_their_draws(config: Config) -> None:
     """Draw 0 is the payload, 1 and 2 its place, 3 the friction, 4 the gain."""
     names = ("payload", "friction", "gains")
-    payload, friction, gains = (make_scenarios(config, name, 4, 60.0, 2)[1] for name in names)
+    payload, friction, gains = (draw_suite(config, name, 4, 60.0, 2).params for name in names)
     others = np.asarray([draws(2, k)[1] for k in range(4)])
     np.testing.assert_allclose(payload.payload, 5 * others[:, 0])
     np.testing.assert_allclose(payload.payload_at[:, 0], 0.1 * others[:, 1] - 0.05)
@@ -68,7 +69,7 @@ def test_circumstances_by_their_draws(config: Config) -> None:
 def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
     """The targets of `paper`, at up to 4.453 deg/s or stretched up to the legs' reach."""
     paper, fast, steep = (
-        make_scenarios(config, name, 4, 60.0, 2)[0] for name in ("paper", "fast", "steep")
+        draw_suite(config, name, 4, 60.0, 2).scenario for name in ("paper", "fast", "steep")
     )
     others = np.asarray([draws(2, k)[1] for k in range(4)])
     np.testing.assert_allclose(fast.rate, 3.5 + (4.4531 - 3.5) * others[:, DRAWS], atol=1e-4)
@@ -81,56 +82,64 @@ def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
 
 def test_pushes_by_their_draws(config: Config) -> None:
     """Kicks of 0.2 to 0.4 m/s every 5 s; a scenario's come from a generator of their own."""
-    pushes = make_pushes(config, "push", 3, 60.0, 5)
-    assert pushes.at.tolist() == [25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 275]
+    pushes = draw_suite(config, "push", 3, 60.0, 5).pushes
+    assert pushes.due[2].tolist() == [25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 275]
     for k in range(3):
         speed, turn = np.random.default_rng((5, k, 2)).uniform(size=(11, 2)).T
         speed, turn = 0.2 + 0.2 * speed, 2 * np.pi * turn
         expected = np.stack((speed * np.cos(turn), speed * np.sin(turn)), axis=-1)
-        np.testing.assert_allclose(pushes.kicks[k], expected, atol=1e-12)
-    fewer, shorter = make_pushes(config, "push", 2, 60.0, 5), make_pushes(config, "push", 3, 26, 5)
-    np.testing.assert_array_equal(fewer.kicks, pushes.kicks[:2])
-    np.testing.assert_array_equal(shorter.kicks, pushes.kicks[:, :5])
+        np.testing.assert_allclose(pushes.velocity[k], expected, atol=1e-12)
+    fewer = draw_suite(config, "push", 2, 60.0, 5).pushes
+    shorter = draw_suite(config, "push", 3, 26, 5).pushes
+    np.testing.assert_array_equal(fewer.velocity, pushes.velocity[:2])
+    np.testing.assert_array_equal(shorter.velocity, pushes.velocity[:, :5])
 
 
 def test_pushes_happen_in_the_world_of_paper_and_in_no_other_suite(config: Config) -> None:
-    push, paper = (make_scenarios(config, name, 4, 60.0, 2) for name in ("push", "paper"))
-    for ours, theirs in zip((*push[0], *push[1]), (*paper[0], *paper[1]), strict=True):
+    push, paper = (draw_suite(config, name, 4, 60.0, 2) for name in ("push", "paper"))
+    for ours, theirs in zip(push.scenario, paper.scenario, strict=True):
         np.testing.assert_array_equal(ours, theirs)
+    assert push.params is not None
+    for values in (push.params.payload, push.params.imu_noise, push.params.delay):
+        assert not values.any()
     for name in SUITES:
-        kicks = make_pushes(config, name, 4, 60.0, 2).kicks
-        assert kicks.shape == (4, 11 if name == "push" else 0, 2)
+        pushes = draw_suite(config, name, 4, 60.0, 2).pushes
+        assert (None if pushes is None else pushes.velocity.shape) == (
+            (4, 11, 2) if name == "push" else None
+        )
 
 
 def test_a_config_beyond_the_limits_is_left_as_it_is(config: Config) -> None:
     """A board that is faster than can be followed is no slower in `fast`."""
     quick = with_task(config, board_rate=6.0)
-    np.testing.assert_array_equal(make_scenarios(quick, "fast", 3, 20, 0)[0].rate, np.full(3, 6.0))
+    np.testing.assert_array_equal(
+        draw_suite(quick, "fast", 3, 20, 0).scenario.rate, np.full(3, 6.0)
+    )
 
 
 @pytest.mark.parametrize(("duration", "targets"), [(5.0, 2), (10.0, 2), (10.1, 3), (60.0, 7)])
 def test_there_are_targets_to_the_end(config: Config, duration: float, targets: int) -> None:
-    assert make_scenarios(config, "paper", 2, duration, 0)[0].targets.shape == (2, targets, 2)
+    assert draw_suite(config, "paper", 2, duration, 0).scenario.targets.shape == (2, targets, 2)
 
 
 def test_a_board_that_does_not_arrive_is_refused(config: Config) -> None:
     """14 deg at 3.5 deg/s take 4 s; in `steep` they may be 2 * 10.3 deg."""
     just = with_task(config, target_period=4.0)
     for suite in ("paper", "corner", "fast"):
-        make_scenarios(just, suite, 5, 20, 0)
+        draw_suite(just, suite, 5, 20, 0)
     with pytest.raises(
         SuiteError, match=r"target_period is 4\.0 s, but in suite 'steep' .* [45]\.\d"
     ):
-        make_scenarios(just, "steep", 50, 20, 0)
+        draw_suite(just, "steep", 50, 20, 0)
     with pytest.raises(
         SuiteError, match=r"target_period is 3\.99 s, but in suite 'corner' .* 4\.0"
     ):
-        make_scenarios(with_task(config, target_period=3.99), "corner", 1, 20, 0)
+        draw_suite(with_task(config, target_period=3.99), "corner", 1, 20, 0)
 
 
 def test_impossible_wishes_are_refused(config: Config) -> None:
     with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
-        make_scenarios(config, "paper", 1, 10, -1)
+        draw_suite(config, "paper", 1, 10, -1)
     with pytest.raises(SuiteError, match="unknown suite 'moon'; known suites: paper, corner, noi"):
         find_suite("moon")
 
@@ -148,12 +157,12 @@ def test_no_seed_serves_two_purposes() -> None:
 
 
 def test_paper_fills_the_disc_and_corner_its_corners(config: Config) -> None:
-    paper = make_scenarios(config, "paper", 400, 60, 0)[0].targets
+    paper = draw_suite(config, "paper", 400, 60, 0).scenario.targets
     size = np.linalg.norm(paper, axis=-1)
     assert size.max() <= 7
     assert np.mean(size) == pytest.approx(3.5, abs=0.15)
     assert np.abs(paper.mean(axis=(0, 1))).max() < 0.2
-    corner = make_scenarios(config, "corner", 50, 60, 0)[0].targets
+    corner = draw_suite(config, "corner", 50, 60, 0).scenario.targets
     assert np.all(np.abs(corner) == 7)
     assert len(np.unique(corner.reshape(-1, 2), axis=0)) == 4
 
@@ -175,25 +184,25 @@ def test_authority_and_reach_by_hand(config: Config, robot: Robot) -> None:
         ("payload", "payload", 0.0, 5.0),
         ("friction", "friction", 0.4, 1.0),
         ("gains", "gain", 0.8, 1.2),
-        ("latency", "latency", 1.0, 1.0),
+        ("latency", "delay", 1.0, 1.0),
     ],
 )
 def test_conditions_fill_their_range(
     config: Config, suite: str, field: str, least: float, most: float
 ) -> None:
-    conditions = make_scenarios(config, suite, 300, 10, 0)[1]
+    conditions = draw_suite(config, suite, 300, 10, 0).params
     values = getattr(conditions, field)
     margin = 0.03 * (most - least)
     assert least <= values.min() <= least + margin
     assert most - margin <= values.max() <= most
-    nominal = make_scenarios(config, "paper", 300, 10, 0)[1]
+    nominal = draw_params(RandomizationConfig(), find_robot("quadruped"), np.zeros((300, DRAWS)))
     for name in conditions._fields:
         if name not in (field, "payload_at"):
             np.testing.assert_array_equal(getattr(conditions, name), getattr(nominal, name))
 
 
 def test_noise_is_that_of_a_data_sheet(config: Config) -> None:
-    sigma = make_scenarios(config, "noise", 3, 10, 0)[1].imu_noise
+    sigma = draw_suite(config, "noise", 3, 10, 0).params.imu_noise
     np.testing.assert_array_equal(sigma, np.tile((0.002,) * 3 + (0.023,) * 3, (3, 1)))
 
 
@@ -201,15 +210,15 @@ def test_every_suite_follows_the_configs_incline(config: Config) -> None:
     flat = with_task(config, max_incline=2.0)
     for name, suite in SUITES.items():
         if not suite.steep:
-            assert np.abs(make_scenarios(flat, name, 20, 60, 0)[0].targets).max() <= 2.0
+            assert np.abs(draw_suite(flat, name, 20, 60, 0).scenario.targets).max() <= 2.0
 
 
 def test_loads_and_kicks_go_with_the_robot() -> None:
     """B2 is 5.493 times as heavy as ours, and 1.702 times as long."""
     config = for_robot(preset("default"), "b2")
-    _, conditions = make_scenarios(config, "payload", 200, 1.0, 0)
+    conditions = draw_suite(config, "payload", 200, 1.0, 0).params
     assert conditions.payload.max() == pytest.approx(5 * 5.493, rel=0.03)
     assert np.abs(conditions.payload_at[:, :2]).max() == pytest.approx(0.05 * 1.702, rel=0.03)
-    speeds = np.linalg.norm(make_pushes(config, "push", 100, 60.0, 0).kicks, axis=-1)
+    speeds = np.linalg.norm(draw_suite(config, "push", 100, 60.0, 0).pushes.velocity, axis=-1)
     limits = (speeds.min(), speeds.max())
     assert limits == pytest.approx((0.2 * 1.702, 0.4 * 1.702), rel=0.01)

@@ -7,7 +7,7 @@ import pytest
 from mjx_balance import load_policy
 from mjx_balance.config import Config, flatten, preset, to_dict
 from mjx_balance.evaluation.rollout import evaluate, policy_scene
-from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.evaluation.suites import draw_suite
 from mjx_balance.sim.scene import Scene
 
 FOLDER = Path(__file__).parents[2] / "policies"
@@ -63,8 +63,9 @@ def test_policy_balances(path: Path, suite: str, mean: float, most: float) -> No
 
 def test_scenarios_of_the_check_do_tilt(config: Config, scene: Scene) -> None:
     """The limits above mean something: these boards take a standing robot down."""
+    from mjx_balance.envs.batch import Episodes
     from mjx_balance.evaluation.controllers import make_controller
     from mjx_balance.evaluation.rollout import roll_out
 
-    drawn, _ = make_scenarios(config, "corner", 8, 20.0, 11)
-    assert roll_out(scene, make_controller("none", scene), drawn, 20.0).fell.all()
+    drawn = draw_suite(config, "corner", 8, 20.0, 11).scenario
+    assert roll_out(scene, make_controller("none", scene), Episodes(drawn), 20.0).fell.all()

@@ -12,7 +12,8 @@ from matplotlib.collections import FillBetweenPolyCollection, QuadMesh
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config
-from mjx_balance.evaluation.rollout import Envelope, Rollout
+from mjx_balance.evaluation.envelope import Envelope
+from mjx_balance.evaluation.rollout import Rollout
 from mjx_balance.report import figures
 from mjx_balance.sim.scene import Scene
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjx_balance.evaluation.rollout import Envelope, Rollout
+from mjx_balance.evaluation.envelope import Envelope
+from mjx_balance.evaluation.rollout import Rollout
 from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report import measuring
 from mjx_balance.report.measuring import load_or_measure

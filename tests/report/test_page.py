@@ -20,7 +20,7 @@ import pytest
 
 from mjx_balance.cli import main
 from mjx_balance.config import Config, preset, to_dict
-from mjx_balance.evaluation.rollout import Envelope
+from mjx_balance.evaluation.envelope import Envelope
 from mjx_balance.policy.file import load_policy, save_policy
 from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.policy.network import Policy

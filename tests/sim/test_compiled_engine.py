@@ -8,23 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fixtures.fleet import episodes_of, with_state
 
 from mjx_balance.config import Config, preset
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.rollout import roll_out
+from mjx_balance.machine import cores
+from mjx_balance.sim.domain_randomization import MODEL_PARAMS
 from mjx_balance.sim.engines import ffi
-from mjx_balance.sim.engines.choice import make_engine
-from mjx_balance.sim.engines.compiled import VARIED
-from mjx_balance.sim.engines.engine import Engine, PhysicsState, settled
+from mjx_balance.sim.engines.jax_engine import JaxEngine, PhysicsState
 from mjx_balance.sim.engines.mujoco import MujocoEngine
+from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.sim.scene import Scene, load_scene
-from mjx_balance.task.pushes import Pushes
-from mjx_balance.task.randomization import Conditions, draw_conditions
-from mjx_balance.task.tilt import Scenario
+from mjx_balance.task.randomization import DomainParams, draw_params
 
 ENVS, EPISODE, STAND = 32, 50, 220
-KICKED = np.asarray((13, 25, 38))
-"""Decisions of an episode that begin with a kick: 2.5, 5 and 7.5 s, in decisions of 0.2 s."""
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +37,8 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def engine(scene: Scene) -> Engine:
-    return make_engine(scene)
+def engine(scene: Scene) -> JaxEngine:
+    return make_engine(scene.config, scene)
 
 
 def in_double(tree: Any) -> dict[str, np.ndarray]:
@@ -50,24 +48,22 @@ def in_double(tree: Any) -> dict[str, np.ndarray]:
 def test_training_and_evaluation_have_the_same_physics(compiled: Any) -> None:
     """10 s under feedback, payload, friction, gains and latency; what differs is float32."""
     env, start = compiled.env, compiled.reset(compiled.keys(1))
-    quiet = start.info["conditions"]._replace(imu_noise=jnp.zeros((ENVS, 6)))
+    quiet = start.pipeline_state.params._replace(imu_noise=jnp.zeros((ENVS, 6)))
     act = compiled.feedback(EPISODE)
     states = compiled.drive(compiled.under(start, quiet), act, EPISODE)
     tilt = np.asarray([state.metrics["tilt_deg"] for state in states[1:]])
     rollout = roll_out(
         env.scene,
-        lambda view: act(view.obs, view.decision),
-        Scenario(**in_double(states[0].info["scenario"])),
+        lambda view: act(view.obs, view.env_steps),
+        episodes_of(states[0]),
         10.0,
-        conditions=Conditions(**in_double(states[0].info["conditions"])),
-        pushes=Pushes(np.asarray(states[0].info["kicks"], float), KICKED),
         record=True,
     )
     assert not rollout.fell.any()
     theirs = rollout.tilt.reshape(ENVS, EPISODE, -1).mean(axis=-1).T
     assert rollout.qpos is not None
     # The first second, before an observation at the edge of two actions has chosen another one.
-    qpos = np.asarray([state.pipeline_state.qpos for state in states[1:6]])
+    qpos = np.asarray([state.pipeline_state.physics.qpos for state in states[1:6]])
     np.testing.assert_allclose(qpos, rollout.qpos[:, 49:250:50].swapaxes(0, 1), atol=2e-5)
     np.testing.assert_allclose(tilt[:5], theirs[:5], atol=2e-4)
     assert tilt.mean() == pytest.approx(theirs.mean(), rel=0.01)
@@ -81,7 +77,7 @@ def test_the_envs_of_both_engines_agree(fleet: Any, compiled: Any, closed_loop: 
     worst = {"tilt": [], "imu": [], "obs": []}
     for theirs in closed_loop[1:]:
         state = compiled.step(state, jnp.asarray(theirs.info["action"]))
-        memory = (state.info["memory"].imu, theirs.info["memory"].imu)
+        memory = (state.pipeline_state.memory.imu, theirs.pipeline_state.memory.imu)
         pairs = {
             "tilt": (state.metrics["tilt_deg"], theirs.metrics["tilt_deg"]),
             "imu": memory,
@@ -96,26 +92,29 @@ def test_the_envs_of_both_engines_agree(fleet: Any, compiled: Any, closed_loop: 
 
 
 @pytest.fixture(scope="module")
-def circumstances(fleet_config: Config) -> Callable[[int, int], Conditions]:
+def circumstances(fleet_config: Config) -> Callable[[int, int], DomainParams]:
     """Seed and number of envs -> their circumstances."""
 
-    def draw(seed: int, count: int) -> Conditions:
+    def draw(seed: int, count: int) -> DomainParams:
         uniform = np.random.default_rng(seed).uniform(size=(count, 8))
         robot = load_scene(fleet_config).robot
-        drawn = draw_conditions(fleet_config.randomization, robot, uniform.astype(np.float32))
+        drawn = draw_params(fleet_config.randomization, robot, uniform.astype(np.float32))
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), drawn)
 
     return draw
 
 
-def moved(engine: Engine, state: PhysicsState, ctrl: Any, conditions: Conditions | None) -> Any:
+def moved(
+    engine: JaxEngine, state: PhysicsState, ctrl: Any, conditions: DomainParams | None
+) -> Any:
     axes = (0, 0, None if conditions is None else 0)
-    return jax.device_get(jax.jit(jax.vmap(engine, axes))(state, ctrl, conditions))
+    return jax.device_get(jax.jit(jax.vmap(engine.physics, axes))(state, ctrl, conditions))
 
 
-def held(scene: Scene, count: int) -> tuple[PhysicsState, jax.Array]:
+def held(engine: JaxEngine, count: int) -> tuple[PhysicsState, jax.Array]:
     """Robots at rest that are told 50 random things near to where they stand."""
-    state = jax.tree.map(lambda x: jnp.tile(x, (count, 1)), settled(scene))
+    state = jax.tree.map(lambda x: jnp.tile(x, (count, 1)), engine.initial())
+    scene = engine.scene
     hold = np.zeros(scene.model.nu)
     hold[scene.leg_ctrl] = scene.stance.qpos[scene.leg_qpos] + scene.stance.leg_trim
     noise = np.random.default_rng(0).normal(size=(count, 50, scene.model.nu))
@@ -123,10 +122,10 @@ def held(scene: Scene, count: int) -> tuple[PhysicsState, jax.Array]:
 
 
 def test_a_call_depends_on_its_arguments_alone(
-    fleet: Any, scene: Scene, engine: Engine, circumstances: Any
+    fleet: Any, scene: Scene, engine: JaxEngine, circumstances: Any
 ) -> None:
     """Whatever circumstances, numbers of envs and devices were called for before."""
-    state, ctrl = held(scene, 6)
+    state, ctrl = held(engine, 6)
     first, second = circumstances(0, 6), circumstances(1, 6)
     mixed = jax.tree.map(lambda a, b: a.at[2:4].set(b[2:4]), first, second)
     plain = jax.tree.map(jnp.asarray, fleet.nominal(6))
@@ -145,48 +144,49 @@ def test_a_call_depends_on_its_arguments_alone(
 
 
 def test_a_decision_is_that_of_the_c_engine(
-    scene: Scene, engine: Engine, circumstances: Any
+    scene: Scene, engine: JaxEngine, circumstances: Any
 ) -> None:
     """State, IMU and tilt of robots under loads, against the engine that evaluates."""
-    state, ctrl = held(scene, 4)
+    state, ctrl = held(engine, 4)
     conditions = circumstances(0, 4)
     after, motion = moved(engine, state, ctrl, conditions)
-    plain = MujocoEngine(scene, 4, Conditions(**in_double(conditions)))
-    plain.place(*(np.asarray(x, float) for x in state))
-    expected = plain.advance(np.arange(4), np.asarray(ctrl, float))
-    np.testing.assert_allclose(after.qpos, expected.qpos[:, -1], rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(motion.imu, expected.imu, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(motion.tilt, expected.tilt, rtol=1e-5, atol=1e-6)
-    for name, value in zip(after._fields, plain.whole_state(), strict=True):
+    plain = MujocoEngine(scene, 4)
+    plain.set_state(*(np.asarray(x, float) for x in state))
+    params = DomainParams(**in_double(conditions))
+    expected = plain.roll(np.arange(4), np.asarray(ctrl, float), params)
+    for name in motion._fields:
+        ours, theirs = getattr(motion, name), getattr(expected, name)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+    for name, value in zip(after._fields, plain.state(), strict=True):
         np.testing.assert_allclose(getattr(after, name), value, rtol=1e-5, atol=1e-6)
 
 
 def test_seeds_of_envs_are_rows_of_one_batch(
-    scene: Scene, engine: Engine, circumstances: Any
+    scene: Scene, engine: JaxEngine, circumstances: Any
 ) -> None:
-    state, ctrl = held(scene, 6)
+    state, ctrl = held(engine, 6)
     conditions = circumstances(3, 6)
     flat = moved(engine, state, ctrl, conditions)
     split = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), (state, ctrl, conditions))
-    nested = jax.device_get(jax.jit(jax.vmap(jax.vmap(engine)))(*split))
+    nested = jax.device_get(jax.jit(jax.vmap(jax.vmap(engine.physics)))(*split))
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a.reshape(b.shape), b), nested, flat)
     alone = jax.device_get(
-        jax.jit(engine)(*jax.tree.map(lambda x: x[5], (state, ctrl, conditions)))
+        jax.jit(engine.physics)(*jax.tree.map(lambda x: x[5], (state, ctrl, conditions)))
     )
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[5]), alone, flat)
 
 
 def test_two_devices_move_their_own_robots(
-    scene: Scene, engine: Engine, circumstances: Any
+    scene: Scene, engine: JaxEngine, circumstances: Any
 ) -> None:
     """Twenty calls at once on both: the boards of each are those of one device."""
-    state, ctrl = held(scene, 8)
+    state, ctrl = held(engine, 8)
     conditions = circumstances(4, 8)
     mesh = jax.make_mesh((2,), ("d",), axis_types=(jax.sharding.AxisType.Auto,))
     split = jax.sharding.PartitionSpec("d")
 
-    def many(state: PhysicsState, ctrl: jax.Array, conditions: Conditions) -> PhysicsState:
-        step = lambda state, _: (jax.vmap(engine)(state, ctrl, conditions)[0], None)  # noqa: E731
+    def many(state: PhysicsState, ctrl: jax.Array, conditions: DomainParams) -> PhysicsState:
+        step = lambda state, _: (jax.vmap(engine.physics)(state, ctrl, conditions)[0], None)  # noqa: E731
         return jax.lax.scan(step, state, length=20)[0]
 
     shared = jax.jit(
@@ -199,9 +199,9 @@ def test_two_devices_move_their_own_robots(
     )
 
 
-def test_the_tilt_of_a_simulation_that_warns_is_no_number(scene: Scene, engine: Engine) -> None:
+def test_the_tilt_of_a_simulation_that_warns_is_no_number(scene: Scene, engine: JaxEngine) -> None:
     """MuJoCo stops at a position beyond its bounds, where everything is finite still."""
-    state, ctrl = held(scene, 3)
+    state, ctrl = held(engine, 3)
     far = state._replace(qpos=state.qpos.at[1, 0].set(1e11))
     _, motion = moved(engine, far, ctrl, None)
     assert np.isnan(motion.tilt).all(axis=1).tolist() == [False, True, False]
@@ -223,7 +223,7 @@ def test_no_leg_comes_to_its_limits(compiled: Any) -> None:
     actions = rng.choice((0, 20, 420, 440), (15, ENVS)).repeat(10, axis=0)
     for number, action in enumerate(actions):
         state = compiled.step(state, jnp.asarray(action))
-        angles = np.asarray(state.pipeline_state.qpos)[:, scene.leg_qpos]
+        angles = np.asarray(state.pipeline_state.physics.qpos)[:, scene.leg_qpos]
         left = min(left, float(np.minimum(angles - lowest, highest - angles).min()))
         over, fresh = np.asarray(state.done) > 0, compiled.reset(compiled.keys(1 + number))
         state = jax.tree.map(
@@ -239,11 +239,11 @@ def test_a_robot_that_diverges_is_seen_and_leaves_the_others_alone(
     compiled: Any, broken: float
 ) -> None:
     start = compiled.reset(compiled.keys(2))
-    physics = start.pipeline_state
+    physics = start.pipeline_state.physics
     spoilt = physics._replace(qvel=physics.qvel.at[3, 8].set(broken))
     action = jnp.full(ENVS, STAND)
     after, sound = (
-        jax.device_get(compiled.step(start.replace(pipeline_state=x), action))
+        jax.device_get(compiled.step(with_state(start, physics=x), action))
         for x in (spoilt, physics)
     )
     assert after.metrics["diverged"].tolist() == [float(k == 3) for k in range(ENVS)]
@@ -287,4 +287,15 @@ def test_host_functions_see_the_buffers_themselves() -> None:
 def test_an_env_says_which_engine_it_has(compiled: Any) -> None:
     assert compiled.env.backend == "mujoco"
     assert BalanceEnv().backend == "mjx"
-    assert VARIED == ("payload", "payload_at", "friction", "gain")
+    assert MODEL_PARAMS == ("payload", "payload_at", "friction", "gain")
+
+
+def test_engines_of_other_threads_have_other_names(scene: Scene) -> None:
+    """A second env of the scene, over more devices, does not get the first one's threads."""
+    before = set(ffi.registered())
+    for devices in (1, 2):
+        make_engine(dataclasses.replace(scene.config, num_devices=devices), scene)
+    threads = {max(1, cores() // devices) for devices in (1, 2)}
+    ours = {f"mjx_balance.{scene.hash}.{count}" for count in threads}
+    assert ours <= set(ffi.registered())
+    assert set(ffi.registered()) - before <= ours

@@ -9,22 +9,18 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from fixtures.fleet import episodes_of
 from mujoco import mjx
 
 from mjx_balance.config import Config
 from mjx_balance.evaluation.rollout import roll_out
-from mjx_balance.sim.engines.engine import settled
-from mjx_balance.sim.engines.mjx import mjx_engine
 from mjx_balance.sim.engines.mujoco import MujocoEngine
+from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.sim.scene import Scene, scene_dir
-from mjx_balance.task.decision import Targets
-from mjx_balance.task.pushes import Pushes
-from mjx_balance.task.randomization import Conditions
-from mjx_balance.task.tilt import Scenario
+from mjx_balance.task.randomization import DomainParams
+from mjx_balance.task.step import Targets
 
 ENVS, EPISODE = 32, 50
-KICKED = np.asarray((13, 25, 38))
-"""Decisions of an episode that begin with a kick: 2.5, 5 and 7.5 s, in decisions of 0.2 s."""
 
 
 class Course(NamedTuple):
@@ -43,28 +39,19 @@ def courses(fleet: Any, closed_loop: list[Any]) -> tuple[Course, Course]:
     env, before, after = fleet.env, closed_loop[:-1], closed_loop[1:]
     ours = Course(
         np.asarray([s.obs for s in before]),
-        np.asarray([s.info["memory"].imu for s in before]),
+        np.asarray([s.pipeline_state.memory.imu for s in before]),
         np.asarray([s.info["action"] for s in after]),
-        np.asarray([s.pipeline_state.qpos for s in before]),
+        np.asarray([s.pipeline_state.physics.qpos for s in before]),
         np.asarray([s.metrics["tilt_deg"] for s in after]),
     )
     act, views, actions = fleet.feedback(EPISODE), [], []
 
     def watched(view: Any) -> np.ndarray:
         views.append(view)
-        actions.append(act(view.obs, view.decision))
+        actions.append(act(view.obs, view.env_steps))
         return actions[-1]
 
-    start = closed_loop[0].info
-    double = {k: np.asarray(v, float) for k, v in start["conditions"]._asdict().items()}
-    rollout = roll_out(
-        env.scene,
-        watched,
-        Scenario(*(np.asarray(x, float) for x in start["scenario"])),
-        10.0,
-        conditions=Conditions(**double),
-        pushes=Pushes(np.asarray(start["kicks"], float), KICKED),
-    )
+    rollout = roll_out(env.scene, watched, episodes_of(closed_loop[0]), 10.0)
     assert not rollout.fell.any()
     theirs = Course(
         np.asarray([view.obs for view in views]),
@@ -172,9 +159,9 @@ def test_mjx_solves_as_the_config_says_and_leaves_the_scene_alone(
     original = mjx.put_model
     monkeypatch.setattr(mjx, "put_model", put_model)
     config = dataclasses.replace(config, solver_iterations=7, line_search_iterations=9)
-    engine = mjx_engine(dataclasses.replace(scene, config=config))
-    state, ctrl = settled(scene), jnp.zeros((1, scene.model.nu))
-    jax.eval_shape(lambda: engine(state, ctrl, None))
+    engine = make_engine(config, scene)
+    state, ctrl = engine.initial(), jnp.zeros((1, scene.model.nu))
+    jax.eval_shape(lambda: engine.physics(state, ctrl, None))
     assert seen == [(7, 9, 0.004)]
     assert scene.model.opt.iterations == 100
     assert scene.model.opt.ls_iterations == 50
@@ -217,7 +204,7 @@ def test_c_engine_is_mj_step(scene: Scene) -> None:
     hold = np.zeros(scene.model.nu)
     hold[scene.leg_ctrl] = scene.stance.qpos[scene.leg_qpos] + scene.stance.leg_trim
     ctrl = hold + 0.02 * rng.uniform(-1, 1, (2, 50, scene.model.nu))
-    motion = engine.advance(ids, ctrl)
+    motion, qpos_path = engine.roll(ids, ctrl, None), engine.recorded["qpos"]
     for row, number in enumerate(ids):
         data = mujoco.MjData(scene.model)
         data.qpos, data.qvel = scene.stance.qpos, scene.stance.qvel
@@ -226,18 +213,19 @@ def test_c_engine_is_mj_step(scene: Scene) -> None:
             data.ctrl = ctrl[row, step]
             mujoco.mj_step(scene.model, data)
             sensors = [data.sensor(f"robot/{name}").data for name in ("gyro", "accelerometer")]
-            np.testing.assert_allclose(motion.qpos[row, step], data.qpos, atol=1e-12)
+            np.testing.assert_allclose(qpos_path[row, step], data.qpos, atol=1e-12)
+            legs = data.qpos[scene.leg_qpos]
+            np.testing.assert_allclose(motion.joint_angles[row, step], legs, atol=1e-12)
             np.testing.assert_allclose(motion.imu[row, step], np.concatenate(sensors), atol=1e-9)
             turn = np.zeros(9)
             mujoco.mju_quat2Mat(turn, data.joint("robot/root").qpos[3:])
             tilt = np.degrees(np.arccos(turn[8]))
             assert motion.tilt[row, step] == pytest.approx(tilt, abs=1e-5)
-        qpos, qvel = engine.state(np.asarray([number]))
-        np.testing.assert_allclose(qpos[0], data.qpos, atol=1e-12)
-        np.testing.assert_allclose(qvel[0], data.qvel, atol=1e-11)
-    assert not motion.warned.any()
+        qpos, qvel, _ = engine.state()
+        np.testing.assert_allclose(qpos[number], data.qpos, atol=1e-12)
+        np.testing.assert_allclose(qvel[number], data.qvel, atol=1e-11)
     for still in (0, 2):
-        np.testing.assert_array_equal(engine.state(np.asarray([still]))[0][0], scene.stance.qpos)
+        np.testing.assert_array_equal(engine.state()[0][still], scene.stance.qpos)
 
 
 def test_a_push_gives_the_robot_its_momentum_at_once(scene: Scene) -> None:
@@ -247,9 +235,9 @@ def test_a_push_gives_the_robot_its_momentum_at_once(scene: Scene) -> None:
     free = scene.model.jnt_dofadr[scene.model.joint("robot/root").id]
     trunk, board = scene.model.body("robot/trunk").id, scene.model.body("board/board").id
     for k, (x, y) in enumerate([(0.3, -0.1), (0, 0), (0, 0.2)]):
-        qpos, qvel = engine.state(np.asarray([k]))
+        qpos, qvel, _ = engine.state()
         data = mujoco.MjData(scene.model)
-        data.qpos, data.qvel = qpos[0], qvel[0] - scene.stance.qvel
+        data.qpos, data.qvel = qpos[k], qvel[k] - scene.stance.qvel
         np.testing.assert_allclose(data.qvel[free : free + 3], (x, y, 0), atol=1e-12)
         assert np.count_nonzero(np.abs(data.qvel) > 1e-12) == np.count_nonzero((x, y))
         mujoco.mj_forward(scene.model, data)
@@ -266,8 +254,10 @@ def test_c_engine_warns_of_the_robot_that_diverges_alone(scene: Scene) -> None:
     ctrl = np.zeros((2, 5, scene.model.nu))
     ctrl[1, 2] = np.nan
     ids = np.asarray((0, 2))
-    np.testing.assert_array_equal(engine.advance(ids, ctrl).warned, (False, True))
-    np.testing.assert_array_equal(engine.advance(ids, 0 * ctrl[:, :1]).warned, (False, True))
+    for given in (ctrl, 0 * ctrl[:, :1]):
+        for values in engine.roll(ids, given, None):
+            assert np.isnan(values[1]).all()
+            assert np.isfinite(values[0]).all()
 
 
 def test_circumstances_are_those_of_models_made_so(scene: Scene) -> None:
@@ -276,21 +266,22 @@ def test_circumstances_are_those_of_models_made_so(scene: Scene) -> None:
     The first load sits on the trunk's axis. The second does not, and the products of inertia
     that are left out show a little.
     """
-    conditions = Conditions(
+    conditions = DomainParams(
         imu_noise=np.zeros((2, 6)),
         payload=np.asarray((3.0, 5.0)),
         payload_at=np.asarray(((0.0, 0.0, 0.1), (0.05, -0.04, 0.08))),
         friction=np.asarray((0.5, 0.9)),
         gain=np.asarray((0.85, 1.1)),
-        latency=np.zeros(2),
+        delay=np.zeros(2),
     )
-    engine = MujocoEngine(scene, 2, conditions, threads=1)
+    engine = MujocoEngine(scene, 2, threads=1)
     hold = np.zeros(scene.model.nu)
     hold[scene.leg_ctrl] = scene.stance.qpos[scene.leg_qpos] + scene.stance.leg_trim
     ctrl = np.tile(hold, (2, 150, 1))
     turning = 0.00025 * np.arange(150)[:, None]  # 3.6 deg/s
     ctrl[:, :, scene.board_ctrl] = turning * (1.0, -0.7)
-    motion = engine.advance(np.arange(2), ctrl)
+    engine.roll(np.arange(2), ctrl, conditions)
+    path_of = engine.recorded["qpos"]
     for k, most in ((0, 1e-7), (1, 2e-4)):
         model = loaded_model(
             scene,
@@ -304,8 +295,8 @@ def test_circumstances_are_those_of_models_made_so(scene: Scene) -> None:
             data.ctrl = row
             mujoco.mj_step(model, data)
             path.append(data.qpos.copy())
-        np.testing.assert_allclose(motion.qpos[k], path, atol=most)
-    assert np.abs(motion.qpos[0] - motion.qpos[1]).max() > 0.003, "they matter"
+        np.testing.assert_allclose(path_of[k], path, atol=most)
+    assert np.abs(path_of[0] - path_of[1]).max() > 0.003, "they matter"
 
 
 def loaded_model(

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from mjx_balance.config import RandomizationConfig, preset
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import for_robot
-from mjx_balance.sim.domain_randomization import model_fields
+from mjx_balance.sim.domain_randomization import randomized_fields
 from mjx_balance.sim.scene import Scene, load_scene
-from mjx_balance.task.randomization import DRAWS, draw_conditions
+from mjx_balance.task.randomization import DRAWS, draw_params
 
 WORST = RandomizationConfig(payload=8.0, payload_offset=0.1, friction_min=0.3, gain_spread=0.3)
 
@@ -30,14 +30,14 @@ def test_inverse_weights_are_those_that_mujoco_computes(
     scene, robot = any_scene, any_scene.robot
     uniform = np.random.default_rng(0).uniform(size=(5, DRAWS))
     batch = Batch(scene.model, 5, 1)
-    plain = model_fields(scene, draw_conditions(WORST, robot, uniform))
+    plain = randomized_fields(scene, draw_params(WORST, robot, uniform))
     for name in ("body_mass", "body_ipos", "body_inertia"):
         batch.expand(name)[...] = plain[name]
     expected = [batch.expand(name) for name in ("body_invweight0", "dof_invweight0")]
     nominal = [np.array(values) for values in expected]
     batch.set_const()
     assert np.abs(expected[0] / np.maximum(nominal[0], 1e-9) - 1).max() > 0.2, "it matters"
-    got = model_fields(scene, draw_conditions(WORST, robot, xp.asarray(uniform, xp.float32)))
+    got = randomized_fields(scene, draw_params(WORST, robot, xp.asarray(uniform, xp.float32)))
     rtol = 1e-6 if xp is np else 1e-3
     for name, values in zip(("body_invweight0", "dof_invweight0"), expected, strict=True):
         np.testing.assert_allclose(np.asarray(got[name]), values, rtol=rtol, atol=1e-7)
@@ -46,7 +46,7 @@ def test_inverse_weights_are_those_that_mujoco_computes(
 def test_a_payload_by_full_tensors_in_the_trunks_own_axes() -> None:
     """Go2's: turned by a quarter about y, nearly; the products about its principal axes go."""
     scene = load_scene(for_robot(preset("default"), "go2"))
-    load = draw_conditions(WORST, scene.robot, np.full(DRAWS, 0.8))
+    load = draw_params(WORST, scene.robot, np.full(DRAWS, 0.8))
     trunk = scene.model.body("robot/base")
     mass, added, at = trunk.mass[0], float(load.payload), load.payload_at
     axes = Rotation.from_quat(trunk.iquat, scalar_first=True).as_matrix()
@@ -55,14 +55,14 @@ def test_a_payload_by_full_tensors_in_the_trunks_own_axes() -> None:
     for weight, place in ((mass, trunk.ipos), (added, at)):
         arm = place - centre
         whole = whole + weight * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    got = model_fields(scene, load)["body_inertia"][trunk.id]
+    got = randomized_fields(scene, load)["body_inertia"][trunk.id]
     np.testing.assert_allclose(got, np.diag(axes.T @ whole @ axes), rtol=1e-9)
 
 
 def test_without_a_payload_nothing_changes(any_scene: Scene) -> None:
     scene, robot = any_scene, any_scene.robot
     uniform = np.full((1, DRAWS), 0.5)
-    fields = model_fields(scene, draw_conditions(RandomizationConfig(), robot, uniform))
+    fields = randomized_fields(scene, draw_params(RandomizationConfig(), robot, uniform))
     for name, values in fields.items():
         before = getattr(scene.model, name)
         assert values.shape == (1, *before.shape), name
@@ -71,7 +71,7 @@ def test_without_a_payload_nothing_changes(any_scene: Scene) -> None:
 
 def test_one_robot_and_a_batch_of_one_agree(robot: Robot, scene: Scene) -> None:
     uniform = np.random.default_rng(1).uniform(size=DRAWS)
-    one = model_fields(scene, draw_conditions(WORST, robot, uniform))
-    many = model_fields(scene, draw_conditions(WORST, robot, uniform[None]))
+    one = randomized_fields(scene, draw_params(WORST, robot, uniform))
+    many = randomized_fields(scene, draw_params(WORST, robot, uniform[None]))
     for name, values in one.items():
         assert values == pytest.approx(many[name][0]), name

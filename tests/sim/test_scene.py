@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config, ConfigError
 from mjx_balance.robots.catalogue import SHIPPED, Robot
-from mjx_balance.sim.domain_randomization import model_fields
+from mjx_balance.sim.domain_randomization import randomized_fields
 from mjx_balance.sim.scene import (
     BOARD,
     ROBOT,
@@ -24,7 +24,7 @@ from mjx_balance.sim.scene import (
     scene_dir,
     scene_hash,
 )
-from mjx_balance.task.randomization import Conditions
+from mjx_balance.task.randomization import DomainParams
 
 LEGS = ("LF", "RF", "LH", "RH")
 GEOM = mujoco.mjtGeom
@@ -367,15 +367,15 @@ def test_same_scene_same_hash_other_scene_other_hash(config: Config, scene: Scen
     assert scene_hash(build_model(lower)) != scene.hash
 
 
-def circumstances(xp: types.ModuleType = np) -> Conditions:
+def circumstances(xp: types.ModuleType = np) -> DomainParams:
     """Three worlds: nominal; loaded off the centre; loaded on the axis, weak and slippery."""
-    return Conditions(
+    return DomainParams(
         imu_noise=xp.zeros((3, 6)),
         payload=xp.asarray((0.0, 4.0, 2.5)),
         payload_at=xp.asarray(((0.01, 0.02, 0.03), (0.05, -0.04, 0.08), (0.0, 0.0, 0.1))),
         friction=xp.asarray((0.8, 0.4, 0.6)),
         gain=xp.asarray((1.0, 1.1, 0.8)),
-        latency=xp.zeros(3),
+        delay=xp.zeros(3),
     )
 
 
@@ -387,7 +387,7 @@ def point_mass(mass: float, arm: np.ndarray) -> np.ndarray:
 def test_payload_by_the_parallel_axis_theorem(scene: Scene) -> None:
     """Full tensors about the common centre; the products are left out, as documented."""
     trunk, conditions = scene.model.body("robot/trunk").id, circumstances()
-    fields = model_fields(scene, conditions)
+    fields = randomized_fields(scene, conditions)
     mass, inertia = 6.92, np.diag((0.0278, 0.0902, 0.1041))
     for k in range(3):
         load, at = conditions.payload[k], conditions.payload_at[k]
@@ -406,7 +406,7 @@ def test_payload_weighs_what_a_body_on_the_trunk_weighs(scene: Scene) -> None:
     load.mass, load.ipos, load.inertia = 2.5, [0, 0, 0], [1e-12] * 3
     load.explicitinertial = True
     heavier = spec.compile()
-    fields = model_fields(scene, circumstances())
+    fields = randomized_fields(scene, circumstances())
     ours, trunk = plain.body("trunk").id, scene.model.body("robot/trunk").id
     for name in ("body_mass", "body_ipos", "body_inertia"):
         getattr(plain, name)[ours] = fields[name][2, trunk]
@@ -425,7 +425,7 @@ def test_payload_weighs_what_a_body_on_the_trunk_weighs(scene: Scene) -> None:
 
 
 def test_friction_and_gain_reach_every_foot_and_leg_and_nothing_else(scene: Scene) -> None:
-    model, fields = scene.model, model_fields(scene, circumstances())
+    model, fields = scene.model, randomized_fields(scene, circumstances())
     legs, board = scene.leg_ctrl.ravel(), scene.board_ctrl
     for k, (friction, gain) in enumerate(((0.8, 400.0), (0.4, 440.0), (0.6, 320.0))):
         rows = [(friction, friction, 0.005, 0.0001, 0.0001)] * 4
@@ -444,7 +444,7 @@ def test_friction_and_gain_reach_every_foot_and_leg_and_nothing_else(scene: Scen
 
 
 def test_nominal_circumstances_are_the_model(xp: types.ModuleType, scene: Scene) -> None:
-    for name, values in model_fields(scene, circumstances(xp)).items():
+    for name, values in randomized_fields(scene, circumstances(xp)).items():
         assert values.shape == (3, *getattr(scene.model, name).shape)
         np.testing.assert_allclose(values[0], getattr(scene.model, name), rtol=1e-6, atol=1e-9)
 
@@ -452,9 +452,9 @@ def test_nominal_circumstances_are_the_model(xp: types.ModuleType, scene: Scene)
 def test_one_world_in_jax_equals_its_row_in_numpy(scene: Scene) -> None:
     import jax.numpy as jnp
 
-    alone = Conditions(*(jnp.asarray(x[1]) for x in circumstances()))
-    whole = model_fields(scene, circumstances())
-    for name, values in model_fields(scene, alone).items():
+    alone = DomainParams(*(jnp.asarray(x[1]) for x in circumstances()))
+    whole = randomized_fields(scene, circumstances())
+    for name, values in randomized_fields(scene, alone).items():
         np.testing.assert_allclose(values, whole[name][1], rtol=1e-5, atol=1e-8, err_msg=name)
 
 

@@ -8,16 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fixtures.fleet import episodes_of
 
 from mjx_balance.config import ConfigError
 from mjx_balance.evaluation.rollout import roll_out
 from mjx_balance.sim.engines import warp
-from mjx_balance.sim.engines.choice import make_engine
-from mjx_balance.sim.engines.engine import settled
+from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task.pushes import Pushes
-from mjx_balance.task.randomization import Conditions
-from mjx_balance.task.tilt import Scenario
 
 pytestmark = [pytest.mark.warp, pytest.mark.slow]
 pytest.importorskip("warp", reason="needs warp-lang, the extra `warp`")
@@ -40,21 +37,18 @@ def test_training_and_evaluation_have_the_same_physics(warped: Any) -> None:
     """Closed loop, half of the envs nominal, half under payload, friction, gains and latency."""
     env = warped.env
     start = warped.reset(warped.keys(1))
-    start = warped.under(start, warped.half_nominal(jax.device_get(start.info["conditions"])))
+    start = warped.under(start, warped.half_nominal(jax.device_get(start.pipeline_state.params)))
     act = warped.feedback(DECISIONS)
     states = warped.drive(start, act, DECISIONS)
-    double = {k: np.asarray(v, float) for k, v in start.info["conditions"]._asdict().items()}
     rollout = roll_out(
         env.scene,
-        lambda view: act(view.obs, view.decision),
-        Scenario(*(np.asarray(x, float) for x in start.info["scenario"])),
+        lambda view: act(view.obs, view.env_steps),
+        episodes_of(start),
         DECISIONS * env.config.task.ctrl_dt,
-        conditions=Conditions(**double),
-        pushes=Pushes(np.asarray(start.info["kicks"], float), np.asarray((13, 25, 38))),
         record=True,
     )
     assert rollout.qpos is not None
-    qpos = np.asarray([state.pipeline_state.qpos for state in states[1:]])
+    qpos = np.asarray([state.pipeline_state.physics.qpos for state in states[1:]])
     np.testing.assert_allclose(qpos, rollout.qpos[:, 49::50].swapaxes(0, 1), atol=3e-6)
     tilt = np.asarray([state.metrics["tilt_deg"] for state in states[1:]])
     theirs = rollout.tilt.reshape(ENVS, DECISIONS, -1).mean(axis=-1).T
@@ -69,13 +63,14 @@ def test_a_full_buffer_is_an_error(
 ) -> None:
     """A contact that finds no room would be dropped: the robot would sink, and train on."""
     monkeypatch.setattr(warp, "contact_room", lambda model: (contacts, rows))
-    engine = jax.jit(jax.vmap(warp.warp_engine(scene)))
-    state = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), settled(scene))
+    engine = make_engine(scene.config, scene)
+    physics = jax.jit(jax.vmap(engine.physics))
+    state = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), engine.initial())
     hold = np.zeros((2, 3, scene.model.nu), np.float32)
     hold[..., scene.leg_ctrl] = scene.stance.qpos[scene.leg_qpos] + scene.stance.leg_trim
     said = rf"room for {contacts} contacts and {rows} constraint rows per env"
     with pytest.raises(jax.errors.JaxRuntimeError, match=said):
-        jax.block_until_ready(engine(state, hold, None))
+        jax.block_until_ready(physics(state, hold, None))
 
 
 def test_one_call_has_all_envs_however_they_are_vmapped() -> None:
@@ -112,4 +107,4 @@ def test_an_engine_that_is_not_installed_is_refused(
         importlib.util, "find_spec", lambda name, *a: None if name == "warp" else found(name, *a)
     )
     with pytest.raises(ConfigError, match="engine is warp, and warp-lang is not installed; inst"):
-        make_engine(scene)
+        make_engine(scene.config, scene)

@@ -17,7 +17,7 @@ import pytest
 
 from mjx_balance.config import Config, TaskConfig
 from mjx_balance.robots.catalogue import Robot
-from mjx_balance.task import decision
+from mjx_balance.task import step
 from mjx_balance.task.tilt import Scenario
 
 N, LEGS, STEPS = 3, 4, 50
@@ -39,10 +39,10 @@ def task(config: Config) -> TaskConfig:
     )
 
 
-def random_memory(task: TaskConfig, seed: int = 0) -> decision.Memory:
+def random_memory(task: TaskConfig, seed: int = 0) -> step.Memory:
     """Memories of N robots, no two numbers equal."""
     rng = np.random.default_rng(seed)
-    return decision.Memory(
+    return step.Memory(
         heights=0.35 + 0.01 * rng.uniform(-1, 1, (N, LEGS)),
         commanded=0.35 + 0.01 * rng.uniform(-1, 1, (N, 3, LEGS)),
         imu=rng.normal(size=(N, 63, 6)),
@@ -69,7 +69,7 @@ def tolerance(xp: types.ModuleType) -> float:
     return 1e-12 if xp is np else 3e-6
 
 
-def obeyed(memory: decision.Memory, change: np.ndarray, late: Any) -> tuple[Any, Any]:
+def obeyed(memory: step.Memory, change: np.ndarray, late: Any) -> tuple[Any, Any]:
     """Heights asked for and heights that the legs are told, robot by robot, leg by leg."""
     asked, told = np.zeros((2, N, LEGS))
     for n in range(N):
@@ -84,14 +84,14 @@ def test_a_standing_robot_has_always_stood(
     xp: types.ModuleType, task: TaskConfig, robot: Robot
 ) -> None:
     still = np.asarray([(1, 2, 3, 4, 5, 6), (7, 8, 9, 10, 11, 12)], float)
-    memory = decision.start(task, robot, put(xp, still))
+    memory = step.initial_memory(task, robot, put(xp, still))
     np.testing.assert_allclose(np.asarray(memory.heights), np.full((2, 4), 0.35), rtol=1e-6)
     np.testing.assert_allclose(np.asarray(memory.commanded), np.full((2, 3, 4), 0.35), rtol=1e-6)
     assert memory.imu.shape == (2, 63, 6)
     for k in range(63):
         np.testing.assert_array_equal(np.asarray(memory.imu[:, k]), still)
     np.testing.assert_array_equal(np.asarray(memory.tilt), np.zeros(2))
-    one = decision.start(task, robot, put(xp, still[1]))
+    one = step.initial_memory(task, robot, put(xp, still[1]))
     assert [x.shape for x in one] == [(4,), (3, 4), (63, 6), ()]
     np.testing.assert_array_equal(np.asarray(one.imu), np.asarray(memory.imu[1]))
 
@@ -102,7 +102,7 @@ def test_servos_are_told_heights_and_board_step_by_step(
     before = random_memory(task)
     change = np.asarray([(0.003, -0.0012), (-0.0021, 0.0006), (0.0009, 0.0027)])
     late, number = np.asarray((False, True, False)), np.asarray((7.0, 31.0, 52.0))
-    after, targets = decision.controls(
+    after, targets = step.pre_step(
         task,
         robot,
         put(xp, before),
@@ -142,7 +142,7 @@ def test_board_moves_from_the_first_step_and_its_clock_runs_on(
     away = Scenario(np.full((N, 1, 2), 30.0), np.zeros(N), np.full(N, 3.5))
     memory = random_memory(task)
     for number in (0, 1, 2):
-        _, targets = decision.controls(
+        _, targets = step.pre_step(
             task, robot, memory, NO_MOVE, None, away, np.full(N, float(number))
         )
         expected = 0.014 * (50 * number + np.arange(1, 51))
@@ -154,7 +154,7 @@ def test_heights_stop_at_the_legs_reach(task: TaskConfig, robot: Robot) -> None:
     reach = [0.426 * math.cos(knee / 2) + 0.022 for knee in (2.72, 0.838)]
     memory = random_memory(task)._replace(commanded=np.tile(np.asarray(reach)[0], (N, 3, LEGS)))
     change = np.asarray([(0.002, 0.0), (0.0, 0.002), (0.5, 0.5)])
-    after, _ = decision.controls(task, robot, memory, change, None, SCENARIO, np.zeros(N))
+    after, _ = step.pre_step(task, robot, memory, change, None, SCENARIO, np.zeros(N))
     low, high = reach
     expected = [
         (low + 0.002, low, low + 0.002, low),
@@ -168,14 +168,14 @@ def test_a_late_action_is_asked_for_at_once_and_obeyed_one_decision_later(
     xp: types.ModuleType, task: TaskConfig, robot: Robot
 ) -> None:
     """Three raises of the left side by 1, 2 and 3 mm: asked for 1, 3, 6; obeyed 0, 1, 3."""
-    memory = decision.start(task, robot, put(xp, np.zeros((2, 6))))
+    memory = step.initial_memory(task, robot, put(xp, np.zeros((2, 6))))
     level = put(xp, Scenario(np.zeros((2, 1, 2)), np.zeros(2), np.full(2, 3.5)))
     late = xp.asarray((False, True))
     asked, told, first = [], [], []
     for number, millimetres in enumerate((1, 2, 3)):
         change = put(xp, np.asarray([(millimetres * 1e-3, 0.0)] * 2))
         now = put(xp, np.full(2, float(number)))
-        memory, targets = decision.controls(task, robot, memory, change, late, level, now)
+        memory, targets = step.pre_step(task, robot, memory, change, late, level, now)
         asked.append(1e3 * (np.asarray(memory.commanded)[:, -1, 0] - 0.35))
         told.append(1e3 * (np.asarray(memory.heights)[:, 0] - 0.35))
         # Where the knees are told to go first: a fifth of the way from where they were.
@@ -189,10 +189,16 @@ def test_a_late_action_is_asked_for_at_once_and_obeyed_one_decision_later(
 def test_nobody_late_is_the_same_as_no_latency(task: TaskConfig, robot: Robot) -> None:
     change, now = np.full((N, 2), 0.002), np.arange(N) * 1.0
     results = [
-        decision.controls(task, robot, random_memory(task), change, late, SCENARIO, now)
+        step.pre_step(task, robot, random_memory(task), change, late, SCENARIO, now)
         for late in (None, np.zeros(N, bool))
     ]
     jax.tree.map(np.testing.assert_array_equal, *results)
+
+
+def post(task: TaskConfig, robot: Robot, memory: Any, samples: Any, tilts: Any, angles: Any) -> Any:
+    """Memory and outcome for joint angles (..., legs, 3) at the end of a decision."""
+    motion = step.Motion(samples, tilts, angles[..., None, :, :])
+    return step.post_step(task, robot, memory, motion)
 
 
 def readings(seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -205,7 +211,7 @@ def readings(seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_observation_entry_by_entry(xp: types.ModuleType, task: TaskConfig, robot: Robot) -> None:
     """Measured heights, commands of now and two decisions ago, gyro, accelerometer."""
     memory, (samples, tilts, angles) = random_memory(task), readings()
-    after, outcome = decision.outcome(task, robot, *put(xp, (memory, samples, tilts, angles)))
+    after, outcome = post(task, robot, *put(xp, (memory, samples, tilts, angles)))
     assert outcome.obs.shape == (N, 4 + 8 + 4 + 4)
     for n in range(N):
         stream = [*memory.imu[n], *samples[n]]
@@ -252,7 +258,7 @@ def test_rewards_by_hand(
     for seed in (1, 2, 3):
         samples, tilts, angles = readings(seed)
         tilts = tilts * np.asarray([[0.1], [0.5], [1.0]])
-        memory, outcome = decision.outcome(task, robot, memory, *put(xp, (samples, tilts, angles)))
+        memory, outcome = post(task, robot, memory, *put(xp, (samples, tilts, angles)))
         after = [row[-1] if rewarded == "end" else sum(row) / 50 for row in tilts]
         level = [0.4 * math.exp(-1.5 * x) for x in after]
         toward = [0.8 * max(-1, min(1, (a - b) / 2.5)) for a, b in zip(before, after, strict=True)]
@@ -265,17 +271,15 @@ def test_rewards_by_hand(
         before = after
 
 
-@pytest.mark.parametrize("step", [0, 23, 49])
+@pytest.mark.parametrize("number", [0, 23, 49])
 def test_one_step_beyond_six_degrees_is_a_fall(
-    xp: types.ModuleType, task: TaskConfig, robot: Robot, step: int
+    xp: types.ModuleType, task: TaskConfig, robot: Robot, number: int
 ) -> None:
     samples, tilts, angles = readings()
-    tilts[0, step], tilts[1, step], tilts[2, step] = 6.0, 6.001, 6.001
-    tilts[2, step:] = 6.001
-    _, outcome = decision.outcome(
-        task, robot, *put(xp, (random_memory(task), samples, tilts, angles))
-    )
-    np.testing.assert_array_equal(np.asarray(outcome.fell), (False, True, True))
+    tilts[0, number], tilts[1, number], tilts[2, number] = 6.0, 6.001, 6.001
+    tilts[2, number:] = 6.001
+    _, outcome = post(task, robot, *put(xp, (random_memory(task), samples, tilts, angles)))
+    np.testing.assert_array_equal(np.asarray(outcome.terminated), (False, True, True))
     np.testing.assert_allclose(np.asarray(outcome.rewards["fail"]), (0, -0.5, -0.5))
     np.testing.assert_allclose(np.asarray(outcome.tilt), tilts, rtol=1e-6)
     assert not np.asarray(outcome.diverged).any()
@@ -287,14 +291,14 @@ def test_where_physics_diverged_the_last_sample_is_held(
     """And the legs count as where they were told to be, which a late robot's command is not."""
     memory, (samples, tilts, angles) = random_memory(task), readings()
     samples[1, 49, 2] = np.nan
-    after, outcome = decision.outcome(task, robot, *put(xp, (memory, samples, tilts, angles)))
+    after, outcome = post(task, robot, *put(xp, (memory, samples, tilts, angles)))
     held = np.concatenate((memory.imu[1, 50:], np.tile(memory.imu[1, -1], (50, 1))))
     np.testing.assert_allclose(np.asarray(after.imu)[1], held, rtol=1e-6)
     heights = 0.35 + 0.01 * np.asarray(outcome.obs)[1, :4]
     np.testing.assert_allclose(heights, memory.heights[1], atol=1e-5)
     np.testing.assert_array_equal(np.asarray(outcome.tilt)[1], np.full(50, 6.0))
     np.testing.assert_array_equal(np.asarray(outcome.diverged), (False, True, False))
-    np.testing.assert_array_equal(np.asarray(outcome.fell), (False, True, False))
+    np.testing.assert_array_equal(np.asarray(outcome.terminated), (False, True, False))
     assert float(after.tilt[1]) == 6
 
 
@@ -305,8 +309,8 @@ def test_a_hard_bump_is_no_divergence(
     """A robot may feel hundreds of g; thousands are a simulation's."""
     samples, tilts, angles = readings()
     samples[2, 0, 5] = size
-    _, outcome = decision.outcome(task, robot, random_memory(task), samples, tilts, angles)
-    assert outcome.diverged.tolist() == outcome.fell.tolist() == [False, False, diverged]
+    _, outcome = post(task, robot, random_memory(task), samples, tilts, angles)
+    assert outcome.diverged.tolist() == outcome.terminated.tolist() == [False, False, diverged]
 
 
 def test_one_robot_is_a_row_of_a_batch(task: TaskConfig, robot: Robot) -> None:
@@ -317,8 +321,8 @@ def test_one_robot_is_a_row_of_a_batch(task: TaskConfig, robot: Robot) -> None:
     late, number = np.asarray((True, False, True)), np.asarray((0.0, 3.0, 70.0))
 
     def both(memory, change, late, scenario, number, samples, tilts, angles):
-        memory, targets = decision.controls(task, robot, memory, change, late, scenario, number)
-        return targets, decision.outcome(task, robot, memory, samples, tilts, angles)
+        memory, targets = step.pre_step(task, robot, memory, change, late, scenario, number)
+        return targets, post(task, robot, memory, samples, tilts, angles)
 
     inputs = (memory, change, late, SCENARIO, number, samples, tilts, angles)
     batch = both(*inputs)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mjx_balance.config import RandomizationConfig
 from mjx_balance.robots.catalogue import Robot
-from mjx_balance.task.randomization import DRAWS, Conditions, draw_conditions
+from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
 
 RANDOM = RandomizationConfig(
     gyro_noise=0.01,
@@ -25,39 +25,39 @@ RANDOM = RandomizationConfig(
 
 
 def test_every_draw_lands_in_its_own_field(xp: types.ModuleType, robot: Robot) -> None:
-    """Payload, its place on x and on y, friction, gain, latency, by hand."""
-    got = draw_conditions(RANDOM, robot, xp.asarray([0.1, 0.2, 0.7, 0.25, 0.9, 0.2]))
+    """Payload, its place on x and on y, friction, gain, delay, by hand."""
+    got = draw_params(RANDOM, robot, xp.asarray([0.1, 0.2, 0.7, 0.25, 0.9, 0.2]))
     np.testing.assert_allclose(got.payload, 0.5, rtol=1e-6)
     np.testing.assert_allclose(got.payload_at, (-0.024, 0.016, 0.07), rtol=1e-5)
     np.testing.assert_allclose(got.friction, 0.6, rtol=1e-6)
     np.testing.assert_allclose(got.gain, 1.24, rtol=1e-6)
-    assert float(got.latency) == 1.0
+    assert float(got.delay) == 1.0
 
 
 def test_noise_is_per_channel(xp: types.ModuleType, robot: Robot) -> None:
     """Gyro x, y, z, then accelerometer x, y, z."""
-    got = draw_conditions(RANDOM, robot, xp.full((2, DRAWS), 0.5))
+    got = draw_params(RANDOM, robot, xp.full((2, DRAWS), 0.5))
     np.testing.assert_allclose(got.imu_noise, [(0.01,) * 3 + (0.2,) * 3] * 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("k", range(DRAWS))
 def test_a_draw_changes_nothing_but_its_field(robot: Robot, k: int) -> None:
-    fields = ("payload", "payload_at", "payload_at", "friction", "gain", "latency")
+    fields = ("payload", "payload_at", "payload_at", "friction", "gain", "delay")
     uniform = np.full((2, DRAWS), 0.4)
     uniform[1, k] = 0.1
-    got = draw_conditions(RANDOM, robot, uniform)
+    got = draw_params(RANDOM, robot, uniform)
     changed = {name for name, value in got._asdict().items() if (value[0] != value[1]).any()}
     assert changed == {fields[k]}
 
 
 def test_ranges_end_where_they_should(robot: Robot) -> None:
     uniform = np.stack((np.zeros(DRAWS), np.full(DRAWS, 1 - 1e-12)))
-    got = draw_conditions(RANDOM, robot, uniform)
+    got = draw_params(RANDOM, robot, uniform)
     np.testing.assert_allclose(got.payload, (0, 5))
     np.testing.assert_allclose(got.payload_at, [(-0.04, -0.04, 0.07), (0.04, 0.04, 0.07)])
     np.testing.assert_allclose(got.friction, (0.4, 1.2))
     np.testing.assert_allclose(got.gain, (0.7, 1.3))
-    assert got.latency.tolist() == [1, 0]
+    assert got.delay.tolist() == [1, 0]
 
 
 @pytest.mark.parametrize(
@@ -69,14 +69,14 @@ def test_friction_that_is_not_given_is_the_robots(
 ) -> None:
     random = RandomizationConfig(friction_min=least, friction_max=most)
     uniform = np.stack((np.zeros(DRAWS), np.full(DRAWS, 1 - 1e-12)))
-    np.testing.assert_allclose(draw_conditions(random, robot, uniform).friction, expected)
+    np.testing.assert_allclose(draw_params(random, robot, uniform).friction, expected)
 
 
 @pytest.mark.parametrize(("share", "late"), [(0.0, 0), (0.25, 25), (1.0, 100)])
 def test_share_of_the_worlds_that_are_late(robot: Robot, share: float, late: int) -> None:
     """Of 100 evenly spread draws; a share of 0 is nobody, not even the draw 0.0."""
     uniform = np.tile(np.arange(100)[:, None] / 100, (1, DRAWS))
-    got = draw_conditions(RandomizationConfig(latency_share=share), robot, uniform).latency
+    got = draw_params(RandomizationConfig(latency_share=share), robot, uniform).delay
     assert got.sum() == late
     assert set(np.unique(got)) <= {0.0, 1.0}
 
@@ -84,17 +84,17 @@ def test_share_of_the_worlds_that_are_late(robot: Robot, share: float, late: int
 @settings(max_examples=30)
 @given(draws=st.lists(st.floats(0, 1, exclude_max=True), min_size=DRAWS, max_size=DRAWS))
 def test_the_paper_leaves_everything_as_it_is(robot: Robot, draws: list[float]) -> None:
-    got = draw_conditions(RandomizationConfig(), robot, np.asarray(draws))
+    got = draw_params(RandomizationConfig(), robot, np.asarray(draws))
     assert not got.imu_noise.any()
-    assert (got.payload, got.friction, got.gain, got.latency) == (0.0, 0.8, 1.0, 0.0)
+    assert (got.payload, got.friction, got.gain, got.delay) == (0.0, 0.8, 1.0, 0.0)
 
 
 def test_a_batch_keeps_its_shape_and_type(xp: types.ModuleType, robot: Robot) -> None:
     uniform = xp.asarray(np.random.default_rng(0).uniform(size=(2, 3, DRAWS)), xp.float32)
-    got = draw_conditions(RANDOM, robot, uniform)
-    shapes = Conditions((2, 3, 6), (2, 3), (2, 3, 3), (2, 3), (2, 3), (2, 3))
-    assert Conditions(*(value.shape for value in got)) == shapes
+    got = draw_params(RANDOM, robot, uniform)
+    shapes = DomainParams((2, 3, 6), (2, 3), (2, 3, 3), (2, 3), (2, 3), (2, 3))
+    assert DomainParams(*(value.shape for value in got)) == shapes
     assert {value.dtype for value in got} == {np.dtype(np.float32)}
-    alone = draw_conditions(RANDOM, robot, uniform[1, 2])
+    alone = draw_params(RANDOM, robot, uniform[1, 2])
     for whole, one in zip(got, alone, strict=True):
         np.testing.assert_array_equal(whole[1, 2], one)

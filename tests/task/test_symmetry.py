@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from mjx_balance.config import Config
+from mjx_balance.envs.batch import Episodes
 from mjx_balance.evaluation.controllers import View
 from mjx_balance.evaluation.rollout import Rollout, roll_out
-from mjx_balance.evaluation.suites import make_scenarios
+from mjx_balance.evaluation.suites import draw_suite
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.actions import action_table, apply_action
 from mjx_balance.task.observation import observation_names
-from mjx_balance.task.randomization import Conditions
+from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.symmetry import Symmetries, symmetries
 from mjx_balance.task.tilt import Scenario
 
@@ -88,15 +89,15 @@ def test_a_mirrored_action_moves_the_mirrored_feet(config: Config, robot: Robot)
         np.testing.assert_allclose(mirrored, moved[:, index[:4]], atol=1e-9)
 
 
-def loaded(side: float) -> Conditions:
+def loaded(side: float) -> DomainParams:
     """A load on the left or right shoulder, weak servos, late actions: (n,) = (2,)."""
-    return Conditions(
+    return DomainParams(
         imu_noise=np.zeros((2, 6)),
         payload=np.asarray((3.0, 0.0)),
         payload_at=np.tile((0.04, 0.05 * side, 0.08), (2, 1)),
         friction=np.full(2, 0.7),
         gain=np.asarray((0.9, 1.0)),
-        latency=np.asarray((0.0, 1.0)),
+        delay=np.asarray((0.0, 1.0)),
     )
 
 
@@ -105,7 +106,7 @@ def test_the_robot_on_a_mirrored_board_sees_the_mirrored_world(
 ) -> None:
     """3 s of random actions, observations and tilts to 1e-9: left-right is exact."""
     scene, group = dataclasses.replace(scene, config=rich), symmetries(rich.task, robot)
-    drawn, _ = make_scenarios(rich, "paper", 2, 3.0, 0)
+    drawn = draw_suite(rich, "paper", 2, 3.0, 0).scenario
     actions = np.random.default_rng(0).integers(0, 441, (15, 2))
 
     def run(scenario: Scenario, actions: np.ndarray, side: float) -> tuple[np.ndarray, Rollout]:
@@ -113,9 +114,9 @@ def test_the_robot_on_a_mirrored_board_sees_the_mirrored_world(
 
         def act(view: View) -> np.ndarray:
             seen.append(view.obs)
-            return actions[view.decision]
+            return actions[view.env_steps]
 
-        rollout = roll_out(scene, act, scenario, 3.0, conditions=loaded(side))
+        rollout = roll_out(scene, act, Episodes(scenario, loaded(side)), 3.0)
         return np.asarray(seen), rollout
 
     seen, rollout = run(drawn, actions, 1.0)

@@ -245,7 +245,7 @@ def test_a_library_and_a_device_change_the_key(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_code_that_is_traced_is_found_and_no_other() -> None:
     found = {name.removeprefix("mjx_balance.") for name in code(ROOT)}
-    traced = "envs.balance sim.engines.mjx sim.scene config task.reward task.decision"
+    traced = "envs.balance sim.engines.mjx sim.scene config task.reward task.step"
     traced += " training.sizing dqn.dqn dqn.networks dqn.normalization dqn.mesh dqn.replay"
     assert set(traced.split()) <= found
     others = "cli evaluation render report report.progress training.finish training.loop"

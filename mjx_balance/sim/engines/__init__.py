@@ -1,1 +1,1 @@
-"""Physics engines: each moves a scene by one decision."""
+"""Physics engines: each moves a scene by one decision. `table.py` names them all."""

@@ -129,7 +129,10 @@ HostFunction = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
 
 
 def register(name: str, function: HostFunction) -> None:
-    """Makes a function known to XLA on CPUs; a name that is known already keeps its function.
+    """Makes a function known to XLA on CPUs.
+
+    A name that is known already keeps its function, because programs may be calling it: a name
+    must hold whatever its function depends on.
 
     It is called by XLA's threads, several at a time where there are several devices. What it
     raises ends the program as an error of JAX.
@@ -146,9 +149,9 @@ def register(name: str, function: HostFunction) -> None:
         try:
             function(_arrays(frame.arguments), _arrays(frame.results))
         except BaseException as error:
-            said = f"{type(error).__name__}: {error}".encode()
+            message = f"{type(error).__name__}: {error}".encode()
             size = ctypes.sizeof(_ErrorArguments)
-            return frame.api.contents.make_error(_ErrorArguments(size, None, said, INTERNAL))
+            return frame.api.contents.make_error(_ErrorArguments(size, None, message, INTERNAL))
         return None
 
     handler = _HANDLER(handle)
@@ -164,12 +167,12 @@ def registered() -> list[str]:
 
 def _arrays(buffers: _Buffers) -> list[np.ndarray]:
     """The float32 buffers of a call as NumPy arrays over the same memory."""
-    found = []
+    arrays = []
     for k in range(buffers.size):
         buffer = buffers.buffers[k].contents
         if buffer.dtype != FLOAT32:
             raise TypeError(f"buffer {k} is of XLA's type {buffer.dtype}; it must be float32")
         shape = tuple(buffer.dims[: buffer.rank])
         memory = (ctypes.c_float * int(np.prod(shape))).from_address(buffer.data)
-        found.append(np.ctypeslib.as_array(memory).reshape(shape))
-    return found
+        arrays.append(np.ctypeslib.as_array(memory).reshape(shape))
+    return arrays

@@ -7,48 +7,68 @@ import jax
 import mujoco
 from mujoco import mjx
 
-from mjx_balance.sim.domain_randomization import model_fields
-from mjx_balance.sim.engines.engine import Engine, Motion, PhysicsState
+from mjx_balance.sim.domain_randomization import randomized_fields
+from mjx_balance.sim.engines.jax_engine import JaxEngine, PhysicsState
+from mjx_balance.sim.engines.table import Options
+from mjx_balance.sim.measurement import RECORDED, measure
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task.attitude import body_tilt
-from mjx_balance.task.randomization import Conditions
+from mjx_balance.task.randomization import DomainParams
+from mjx_balance.task.step import Motion
 
 
-def trained_model(scene: Scene) -> mujoco.MjModel:
-    """The scene's model with the solver of its config."""
+def training_model(scene: Scene, options: Options) -> mujoco.MjModel:
+    """The scene's model with the solver of the options."""
     model = copy.copy(scene.model)
-    model.opt.iterations = scene.config.solver_iterations
-    model.opt.ls_iterations = scene.config.line_search_iterations
+    model.opt.iterations = options.solver_iterations
+    model.opt.ls_iterations = options.line_search_iterations
     # Rows that MJX would solve at every step, and that never push: heights are clipped.
     model.jnt_limited[:] = False
     return model
 
 
-def mjx_engine(scene: Scene) -> Engine:
-    """Solves as the scene's config says; the model is put on the device when it is first traced."""
+def physics_step(
+    scene: Scene, model: mjx.Model, blank: mjx.Data, state: PhysicsState, ctrl: jax.Array
+) -> tuple[PhysicsState, Motion, mjx.Data]:
+    """One physics step of one env.
+
+    Args:
+      scene: what is measured where.
+      model: of this env.
+      blank: data to put the state into.
+      state: before.
+      ctrl: (nu,) servo targets, rad.
+
+    Returns:
+      The state after it, the motion (without the axis of steps), and all of MJX's data.
+    """
+    data = blank.replace(**state._asdict(), ctrl=ctrl)
+    # TF32 matrix products, the default on recent GPUs, are too coarse for contacts.
+    with jax.default_matmul_precision("highest"):
+        data = mjx.step(model, data)
+    motion = measure(scene, **{name: getattr(data, name) for name in RECORDED})
+    return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), motion, data
+
+
+def mjx_engine(scene: Scene, options: Options) -> JaxEngine:
+    """Puts the model on the device when it is first traced."""
 
     @functools.cache
     def on_device() -> tuple[mjx.Model, mjx.Data]:
-        model, own = trained_model(scene), jax.local_devices()[0]  # not another process's
+        model, own = training_model(scene, options), jax.local_devices()[0]  # not another process's
         with jax.ensure_compile_time_eval():  # constants, though this runs inside a trace
             return mjx.put_model(model, own), mjx.make_data(model, own)
 
-    def advance(
-        state: PhysicsState, ctrl: jax.Array, conditions: Conditions | None
+    def physics(
+        state: PhysicsState, ctrl: jax.Array, params: DomainParams | None
     ) -> tuple[PhysicsState, Motion]:
-        fields = {} if conditions is None else model_fields(scene, conditions)
+        fields = {} if params is None else randomized_fields(scene, params)
         model, blank = on_device()
         env_model = model.replace(**fields)
 
-        def physics_step(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Motion]:
-            data = blank.replace(**state._asdict(), ctrl=ctrl)
-            # TF32 matrix products, the default on recent GPUs, are too coarse for contacts.
-            with jax.default_matmul_precision("highest"):
-                data = mjx.step(env_model, data)
-            state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-            tilt = body_tilt(data.qpos[scene.trunk_quat])
-            return state, Motion(data.sensordata[scene.imu], tilt)
+        def body(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Motion]:
+            state, motion, _ = physics_step(scene, env_model, blank, state, ctrl)
+            return state, motion
 
-        return jax.lax.scan(physics_step, state, ctrl)
+        return jax.lax.scan(body, state, ctrl)
 
-    return advance
+    return JaxEngine(scene, physics)

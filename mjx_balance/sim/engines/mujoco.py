@@ -1,98 +1,105 @@
-"""MuJoCo's C engine: advances many scenarios by one decision, on all cores. No JAX.
+"""MuJoCo's C engine: advances many envs by one decision, on all cores. No JAX.
 
 Runs as MuJoCo ships it: float64, default solver accuracy.
 """
 
-import os
-from typing import NamedTuple
-
 import numpy as np
 from mujoco.batch import Batch
 
-from mjx_balance.sim.domain_randomization import model_fields
+from mjx_balance.machine import cores
+from mjx_balance.sim.domain_randomization import MODEL_PARAMS, randomized_fields
+from mjx_balance.sim.measurement import RECORDED, measure
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task.attitude import body_tilt
-from mjx_balance.task.randomization import Conditions
-
-
-def cores() -> int:
-    """CPU cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-class Motion(NamedTuple):
-    """What happened in one decision of n scenarios."""
-
-    qpos: np.ndarray
-    """(n, sim_steps, nq) after each step."""
-    imu: np.ndarray
-    """(n, sim_steps, 6) gyro in rad/s and accelerometer in m/s^2, before each step."""
-    tilt: np.ndarray
-    """(n, sim_steps) body tilt after each step, deg."""
-    warned: np.ndarray
-    """(n,) whether MuJoCo has warned of a diverging simulation."""
+from mjx_balance.task.randomization import DomainParams
+from mjx_balance.task.step import Motion, Targets
 
 
 class MujocoEngine:
-    """A batch of scenarios of one scene, from the settled stance on; owns their states."""
+    """`task.step.Engine` over a batch of envs of one scene, whose states it owns.
 
-    def __init__(
-        self,
-        scene: Scene,
-        count: int,
-        conditions: Conditions | None = None,
-        threads: int | None = None,
-    ):
-        """Puts `count` robots on their boards.
+    Its `physics` are ids (n,) of envs.
+    """
+
+    def __init__(self, scene: Scene, count: int, threads: int | None = None):
+        """Puts `count` robots into the settled stance.
 
         Args:
           scene: model and stance.
-          count: scenarios.
-          conditions: of each of them (count,); nominal if none.
-          threads: worker threads; all cores if none.
+          count: envs.
+          threads: worker threads; None: all cores.
         """
         self.scene = scene
+        self.recorded: dict[str, np.ndarray] = {}
+        """`RECORDED` fields (n, sim_steps, ...) of the last decision."""
         self._batch = Batch(scene.model, count, threads or cores())
-        if conditions is not None:
-            self.vary(np.arange(count), conditions)
-        self.start(np.arange(count))
+        self._params = np.full((count, 6), np.nan)
+        self.reset(np.arange(count))
 
-    def start(self, ids: np.ndarray) -> None:
-        """Puts scenarios `ids` (n,) back into the settled stance."""
+    def reset(self, ids: np.ndarray) -> None:
+        """Puts envs `ids` (n,) back into the settled stance."""
         stance = self.scene.stance
         self._batch.qpos[ids], self._batch.qvel[ids] = stance.qpos, stance.qvel
         self._batch.qacc_warmstart[ids] = stance.qacc_warmstart
         self._batch.warning[ids] = 0
 
-    def vary(self, ids: np.ndarray, conditions: Conditions) -> None:
-        """Puts scenarios `ids` (n,) into other circumstances (n,)."""
-        for name, values in model_fields(self.scene, conditions).items():
-            self._batch.expand(name)[ids] = values
-        self._batch.set_const(ids)
-
-    def place(self, qpos: np.ndarray, qvel: np.ndarray, qacc_warmstart: np.ndarray) -> None:
-        """Puts all scenarios into states (count, nq), (count, nv), (count, nv), or into one."""
+    def set_state(self, qpos: np.ndarray, qvel: np.ndarray, qacc_warmstart: np.ndarray) -> None:
+        """Puts all envs into states (count, nq), (count, nv), (count, nv)."""
         self._batch.qpos, self._batch.qvel = qpos, qvel
         self._batch.qacc_warmstart = qacc_warmstart
         self._batch.warning[...] = 0
 
-    def whole_state(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What `place` takes, of all scenarios."""
+    def state(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What `set_state` takes, of all envs."""
         return self._batch.qpos, self._batch.qvel, self._batch.qacc_warmstart
 
-    def state(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (n, nq) and velocities (n, nv) of scenarios `ids` (n,)."""
-        return self._batch.qpos[ids], self._batch.qvel[ids]
+    def push(self, physics: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Adds (n, 2) m/s along the world's x and y to the trunks' velocity."""
+        self._batch.qvel[physics[:, None], self.scene.trunk_velocity] += velocity
+        return physics
 
-    def push(self, ids: np.ndarray, kick: np.ndarray) -> None:
-        """Adds (n, 2) m/s along x and y to the velocity of the trunks of scenarios `ids` (n,)."""
-        self._batch.qvel[ids[:, None], self.scene.trunk_velocity] += kick
+    def advance(
+        self, physics: np.ndarray, targets: Targets, params: DomainParams | None
+    ) -> tuple[np.ndarray, Motion]:
+        """Moves envs (n,) by one decision.
 
-    def advance(self, ids: np.ndarray, ctrl: np.ndarray) -> Motion:
-        """Moves scenarios `ids` (n,) through servo targets (n, sim_steps, nu), rad."""
-        out = self._batch.rollout(ctrl.shape[1], ctrl, record=("qpos", "sensordata"), ids=ids)
+        Args:
+          physics: ids (n,).
+          targets: servo targets (n, sim_steps, ...).
+          params: (n,) of these envs; None: nominal. An env that has had some always needs some.
+        """
+        return physics, self.roll(physics, self.scene.ctrl(targets), params)
+
+    def roll(self, ids: np.ndarray, ctrl: np.ndarray, params: DomainParams | None) -> Motion:
+        """`advance` for servo targets (n, sim_steps, nu) in the model's order, rad."""
+        if params is not None:
+            self._randomize(ids, params)
+        out = self._batch.rollout(ctrl.shape[1], ctrl, record=RECORDED, ids=ids)
+        self.recorded = {name: out[name] for name in RECORDED}
         warned = np.any(np.reshape(self._batch.warning[ids], (len(ids), -1)), axis=-1)
-        tilt = body_tilt(out["qpos"][..., self.scene.trunk_quat])
-        return Motion(out["qpos"], out["sensordata"][..., self.scene.imu], tilt, np.asarray(warned))
+        motion = measure(self.scene, **self.recorded)
+        if warned.any():
+            for values in motion:
+                values[warned] = np.nan
+        return motion
+
+    def changed(self, ids: np.ndarray, params: DomainParams) -> np.ndarray:
+        """(n,) whether the model of envs `ids` has other parameters than `params` (n,)."""
+        return (self._params[ids] != _columns(params)).any(axis=1)
+
+    def _randomize(self, ids: np.ndarray, params: DomainParams) -> None:
+        """Gives envs (n,) their parameters (n,); from decision to decision few change."""
+        changed = self.changed(ids, params)
+        if not changed.any():
+            return
+        ids, params = ids[changed], DomainParams(*(x[changed] for x in params))
+        for name, values in randomized_fields(self.scene, params).items():
+            self._batch.expand(name)[ids] = values
+        self._batch.set_const(ids)
+        self._params[ids] = _columns(params)
+
+
+def _columns(params: DomainParams) -> np.ndarray:
+    """(n, 6) those that change the model."""
+    count = len(params.payload)
+    values = [np.reshape(getattr(params, name), (count, -1)) for name in MODEL_PARAMS]
+    return np.concatenate(values, axis=1)

@@ -15,12 +15,13 @@ import warp
 from jax.custom_batching import custom_vmap
 from mujoco import mjx
 
-from mjx_balance.sim.domain_randomization import model_fields
-from mjx_balance.sim.engines.engine import Engine, Motion, PhysicsState
-from mjx_balance.sim.engines.mjx import trained_model
+from mjx_balance.sim.domain_randomization import randomized_fields
+from mjx_balance.sim.engines.jax_engine import JaxEngine, PhysicsState
+from mjx_balance.sim.engines.mjx import physics_step, training_model
+from mjx_balance.sim.engines.table import Options
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task.attitude import body_tilt
-from mjx_balance.task.randomization import Conditions
+from mjx_balance.task.randomization import DomainParams
+from mjx_balance.task.step import Motion
 
 T = TypeVar("T")
 
@@ -70,10 +71,10 @@ def over_all_envs(function: Callable[..., T]) -> Callable[..., T]:
     return batched
 
 
-def warp_engine(scene: Scene) -> Engine:
-    """Solves as the scene's config says, in buffers for every contact that the scene can have."""
+def warp_engine(scene: Scene, options: Options) -> JaxEngine:
+    """Solves in buffers for every contact that the scene can have."""
     warp.config.log_level = warp.LOG_WARNING  # a line per kernel otherwise
-    plain = trained_model(scene)
+    plain = training_model(scene, options)
     # Warp knows no automatic reset that could be disabled.
     plain.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     contacts, rows = contact_room(plain)
@@ -89,24 +90,22 @@ def warp_engine(scene: Scene) -> Engine:
             most = contacts * envs
             return model, mjx.make_data(plain, own, impl="warp", naconmax=most, njmax=rows)
 
-    def physics(
-        state: PhysicsState, ctrl: jax.Array, conditions: Conditions | None
+    def batched_physics(
+        state: PhysicsState, ctrl: jax.Array, params: DomainParams | None
     ) -> tuple[PhysicsState, Motion]:
         """One decision of a batch: every argument has a leading axis of envs."""
         model, blank = on_device(len(ctrl))
-        varied = jax.vmap(functools.partial(model_fields, scene))
-        fields = {} if conditions is None else varied(conditions)
+        randomized = jax.vmap(functools.partial(randomized_fields, scene))
+        fields = {} if params is None else randomized(params)
 
-        def of_one(
+        def one_env(
             state: PhysicsState, ctrl: jax.Array, fields: dict[str, jax.Array]
         ) -> tuple[PhysicsState, tuple[Motion, jax.Array]]:
-            data = mjx.step(model.replace(**fields), blank.replace(**state._asdict(), ctrl=ctrl))
-            moved = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-            tilt = body_tilt(data.qpos[scene.trunk_quat])
-            return moved, (Motion(data.sensordata[scene.imu], tilt), data._impl.overflow)
+            state, motion, data = physics_step(scene, model.replace(**fields), blank, state, ctrl)
+            return state, (motion, data._impl.overflow)
 
-        step = lambda state, ctrl: jax.vmap(of_one)(state, ctrl, fields)  # noqa: E731
-        state, (motion, overflow) = jax.lax.scan(step, state, jnp.swapaxes(ctrl, 0, 1))
+        body = lambda state, ctrl: jax.vmap(one_env)(state, ctrl, fields)  # noqa: E731
+        state, (motion, overflow) = jax.lax.scan(body, state, jnp.swapaxes(ctrl, 0, 1))
         overflowed = jnp.bitwise_and(overflow, ~UNCONVERGED).any()
         jax.lax.cond(overflowed, lambda: jax.debug.callback(refuse), lambda: None)
         return state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), motion)
@@ -117,12 +116,12 @@ def warp_engine(scene: Scene) -> Engine:
             f"{rows} constraint rows per env"
         )
 
-    batched = over_all_envs(physics)
+    over_all = over_all_envs(batched_physics)
 
-    def advance(
-        state: PhysicsState, ctrl: jax.Array, conditions: Conditions | None
+    def physics(
+        state: PhysicsState, ctrl: jax.Array, params: DomainParams | None
     ) -> tuple[PhysicsState, Motion]:
-        arguments = jax.tree.map(lambda x: jnp.asarray(x)[None], (state, ctrl, conditions))
-        return jax.tree.map(lambda x: x[0], batched(*arguments))
+        arguments = jax.tree.map(lambda x: jnp.asarray(x)[None], (state, ctrl, params))
+        return jax.tree.map(lambda x: x[0], over_all(*arguments))
 
-    return advance
+    return JaxEngine(scene, physics)

@@ -1,0 +1,117 @@
+"""The table of physics engines. Nothing else compares an engine's name.
+
+To add one: a module with a function (scene, options) -> `JaxEngine`, a row in `ENGINES`, and its
+name in `Config.engine`.
+"""
+
+import importlib.util
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from mjx_balance.config import Config, ConfigError
+from mjx_balance.sim.scene import Scene
+
+if TYPE_CHECKING:
+    from mjx_balance.sim.engines.jax_engine import JaxEngine
+
+
+class Options(NamedTuple):
+    """What an engine is made with, besides the scene."""
+
+    solver_iterations: int
+    """Of MJX's constraint solver; MuJoCo's C engine stops by itself."""
+    line_search_iterations: int
+    num_devices: int | None
+    """JAX devices that the envs are spread over; None: all."""
+
+
+class EngineRow(NamedTuple):
+    """One engine, and what the rest of the package needs to know of it."""
+
+    name: str
+    """As in `Config.engine`."""
+    make: Callable[[Scene, Options], "JaxEngine"]
+    """Imports the engine on its first call."""
+    platforms: tuple[str, ...] = ()
+    """JAX platforms that it runs on; none named: all."""
+    hardware: str = "every device"
+    """The same in words."""
+    cacheable: bool = True
+    """Whether its traced programs work in another process."""
+    extra: str | None = None
+    """Extra of this package that installs it; none: the extra `train`."""
+    module: str | None = None
+    """What that extra brings, hidden from imports while another engine runs."""
+    distribution: str | None = None
+    """The registry's name of that module."""
+
+
+def _mjx(scene: Scene, options: Options) -> "JaxEngine":
+    from mjx_balance.sim.engines.mjx import mjx_engine
+
+    return mjx_engine(scene, options)
+
+
+def _mujoco(scene: Scene, options: Options) -> "JaxEngine":
+    from mjx_balance.sim.engines.mujoco_ffi import mujoco_engine
+
+    return mujoco_engine(scene, options)
+
+
+def _warp(scene: Scene, options: Options) -> "JaxEngine":
+    from mjx_balance.sim.engines.warp import warp_engine
+
+    return warp_engine(scene, options)
+
+
+ENGINES = {
+    row.name: row
+    for row in (
+        EngineRow("mjx", _mjx),
+        EngineRow("mujoco", _mujoco, platforms=("cpu",), hardware="CPUs"),
+        EngineRow(
+            "warp",
+            _warp,
+            platforms=("cpu", "gpu", "cuda"),
+            hardware="NVIDIA GPUs and CPUs",
+            cacheable=False,  # its kernels live in the process that built them
+            extra="warp",
+            module="warp",
+            distribution="warp-lang",
+        ),
+    )
+}
+
+
+def make_engine(config: Config, scene: Scene) -> "JaxEngine":
+    """The config's engine; only that one is imported.
+
+    Cheap: a run whose program is cached never asks for the physics of its own process.
+
+    Raises:
+      ConfigError: if the engine is not installed.
+    """
+    row = ENGINES[config.engine]
+    if row.module is not None and importlib.util.find_spec(row.module) is None:
+        raise ConfigError(
+            f"engine is {row.name}, and {row.distribution} is not installed; install the extra "
+            f"`{row.extra}` (make train EXTRAS={row.extra}), or choose engine mjx"
+        )
+    options = Options(config.solver_iterations, config.line_search_iterations, config.num_devices)
+    return row.make(scene, options)
+
+
+def check_platform(engine: str, platform: str, device_kind: str) -> None:
+    """Raises `ConfigError` if an engine does not run on a JAX platform."""
+    row = ENGINES[engine]
+    if row.platforms and platform not in row.platforms:
+        on_cpu = "set JAX_PLATFORMS=cpu, or " if row.platforms == ("cpu",) else ""
+        raise ConfigError(
+            f"engine is {engine}, which runs on {row.hardware}, and JAX uses {device_kind}; "
+            f"{on_cpu}choose engine mjx"
+        )
+
+
+def unused_modules(engine: str) -> list[str]:
+    """Modules of the other engines, which a run need not import."""
+    return [row.module for row in ENGINES.values() if row.module and row.name != engine]

@@ -1,0 +1,260 @@
+"""The one composition of a decision, from action to outcome; every env and evaluation calls it.
+
+`step` is `pre_step` (action -> servo targets), an engine (targets -> motion) and `post_step`
+(motion -> observation, reward, failure). Training calls it in JAX for one env, vmapped; evaluation
+and Gymnasium's envs in NumPy for many envs at once. What is random is drawn outside: JAX and NumPy
+draw differently.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from mjx_balance.config import TaskConfig
+from mjx_balance.robots.catalogue import Robot
+from mjx_balance.task import Array, kinematics, tilt
+from mjx_balance.task.actions import apply_action
+from mjx_balance.task.observation import (
+    Signals,
+    extend_history,
+    input_rows,
+    lookback,
+    observe,
+)
+from mjx_balance.task.pushes import Pushes, push_velocity
+from mjx_balance.task.randomization import DomainParams
+from mjx_balance.task.reward import RewardInputs, failed, reward_terms
+
+DIVERGED = 1e4
+"""Magnitude, in rad, rad/s, m/s^2 or deg, from which a value counts as diverged."""
+
+
+class Memory(NamedTuple):
+    """What one decision leaves to the next, besides the state of the physics."""
+
+    heights: Array
+    """(..., legs) foot heights that the legs moved to last, m."""
+    commanded: Array
+    """(..., n, legs) foot heights that the latest actions commanded, the newest
+    last, m; delayed actions stand here before the legs move."""
+    imu: Array
+    """(..., n, 6) latest IMU samples, the newest last, rad/s and m/s^2."""
+    tilt: Array
+    """(...) body tilt of the last reward, deg."""
+
+
+class Targets(NamedTuple):
+    """Servo targets at every physics step of a decision."""
+
+    board: Array
+    """(..., sim_steps, 2) board angles about X and Y, rad."""
+    joints: Array
+    """(..., sim_steps, legs, 3) abduction, hip and knee angles, rad."""
+
+
+class Motion(NamedTuple):
+    """What an engine measures at every physics step of a decision; NaN where it has diverged."""
+
+    imu: Array
+    """(..., sim_steps, 6) gyro in rad/s and accelerometer in m/s^2, before each step."""
+    tilt: Array
+    """(..., sim_steps) body tilt after each step, deg."""
+    joint_angles: Array
+    """(..., sim_steps, legs, 3) after each step, rad."""
+
+
+class Engine(Protocol):
+    """Moves the physics by one decision. `physics` is the engine's own: a state, or env ids."""
+
+    def push(self, physics: Any, velocity: Array) -> Any:
+        """Adds (..., 2) m/s along the world's x and y to the trunk's velocity."""
+        ...
+
+    def advance(
+        self, physics: Any, targets: Targets, params: DomainParams | None
+    ) -> tuple[Any, Motion]:
+        """Moves the physics by `sim_steps` steps; `params` None is the nominal model."""
+        ...
+
+
+class EnvState(NamedTuple):
+    """State of one env, or of a batch of them."""
+
+    physics: Any
+    """The engine's own."""
+    memory: Memory
+    scenario: tilt.Scenario
+    """Where the board goes."""
+    env_steps: Array
+    """(...) decisions since the episode's start."""
+    params: DomainParams | None
+    """None: the nominal model, no sensor noise, no action delay."""
+    pushes: Pushes | None
+
+
+class Outcome(NamedTuple):
+    """What came of a decision."""
+
+    obs: Array
+    """(..., obs_size) the network's next input."""
+    rewards: dict[str, Array]
+    """(...) by name (`reward_terms`); their sum is the reward."""
+    imu: Array
+    """(..., sim_steps, 6) IMU samples with noise, rad/s and m/s^2."""
+    tilt: Array
+    """(..., sim_steps) body tilt after each step, deg."""
+    terminated: Array
+    """(...) bool, whether the body tilted past `fail_tilt`, or the simulation diverged."""
+    diverged: Array
+    """(...) bool, whether the simulation gave values that no robot can reach."""
+
+    @property
+    def reward(self) -> Array:
+        """(...) sum of the terms."""
+        return sum(self.rewards.values())
+
+
+def step(
+    task: TaskConfig,
+    robot: Robot,
+    engine: Engine,
+    state: EnvState,
+    change: Array,
+    noise: Array | None,
+) -> tuple[EnvState, Outcome]:
+    """Takes one decision.
+
+    Args:
+      task: rates, weights, limits, layout.
+      robot: its legs.
+      engine: moves the physics.
+      state: of one env, or of a batch (...).
+      change: (..., 2) a_x and a_y of the action, m.
+      noise: (..., sim_steps, 6) standard normal numbers, one per IMU sample; None: no noise.
+
+    Returns:
+      The state `ctrl_dt` later, and the outcome.
+    """
+    params, physics = state.params, state.physics
+    delayed = None if params is None else params.delay > 0
+    memory, targets = pre_step(
+        task, robot, state.memory, change, delayed, state.scenario, state.env_steps
+    )
+    if state.pushes is not None:
+        physics = engine.push(physics, push_velocity(state.pushes, state.env_steps))
+    physics, motion = engine.advance(physics, targets, params)
+    if noise is not None and params is not None:
+        motion = motion._replace(imu=motion.imu + params.imu_noise[..., None, :] * noise)
+    memory, outcome = post_step(task, robot, memory, motion)
+    state = state._replace(physics=physics, memory=memory, env_steps=state.env_steps + 1)
+    return state, outcome
+
+
+def initial_memory(task: TaskConfig, robot: Robot, still: Array) -> Memory:
+    """The memory of a robot that has been standing for a while.
+
+    Args:
+      task: standing height, lengths of the histories.
+      robot: its legs.
+      still: (..., 6) IMU sample at rest, rad/s and m/s^2.
+    """
+    xp = still.__array_namespace__()
+    rows = input_rows(task, robot)
+    heights = xp.zeros((*still.shape[:-1], len(robot.legs)), still.dtype) + task.body_height
+    return Memory(
+        heights=heights,
+        commanded=_repeated(heights, lookback(rows, "commands")),
+        imu=_repeated(still, lookback(rows, "imu")),
+        tilt=xp.zeros_like(still[..., 0]),
+    )
+
+
+def pre_step(
+    task: TaskConfig,
+    robot: Robot,
+    memory: Memory,
+    change: Array,
+    delayed: Array | None,
+    scenario: tilt.Scenario,
+    env_steps: Array,
+) -> tuple[Memory, Targets]:
+    """Turns an action into servo targets.
+
+    Args:
+      task: rates.
+      robot: its legs.
+      memory: from the last decision.
+      change: (..., 2) a_x and a_y of the action, m.
+      delayed: (...) bool, whether the legs obey one decision later; None: nowhere.
+      scenario: where the board goes.
+      env_steps: (...) decisions since the start.
+
+    Returns:
+      The memory with the new command, and the targets. Those of step i are for time
+      (i + 1) * sim_dt of the decision.
+    """
+    xp = memory.heights.__array_namespace__()
+    last = memory.commanded[..., -1, :]
+    command = apply_action(task, robot, last, change)
+    heights = command if delayed is None else xp.where(delayed[..., None], last, command)
+    sim_step = np.arange(1, task.sim_steps + 1).astype(heights.dtype)
+    time = task.ctrl_dt * env_steps[..., None] + task.sim_dt * sim_step
+    board = tilt.board_angle(task, scenario, time) * (np.pi / 180)
+    path = kinematics.ramp(task, memory.heights, heights)
+    moving = kinematics.joint_angles(robot, path[..., : task.ramp_steps, :])
+    resting = xp.repeat(moving[..., -1:, :, :], task.sim_steps - task.ramp_steps, axis=-3)
+    commanded = extend_history(memory.commanded, command[..., None, :])
+    memory = memory._replace(heights=heights, commanded=commanded)
+    return memory, Targets(board, xp.concatenate((moving, resting), axis=-3))
+
+
+def post_step(
+    task: TaskConfig, robot: Robot, memory: Memory, motion: Motion
+) -> tuple[Memory, Outcome]:
+    """Turns the motion of a decision into observation, reward and failure.
+
+    Where the simulation diverged the robot has fallen: its tilt counts as `fail_tilt` throughout
+    the decision, the IMU holds its last sample, and the legs count as at their targets.
+
+    Args:
+      task: weights, limits, layout.
+      robot: its legs.
+      memory: from `pre_step`.
+      motion: from the engine, sensor noise included.
+
+    Returns:
+      The memory for the next decision, and the outcome.
+    """
+    samples, tilts, angles = motion.imu, motion.tilt, motion.joint_angles[..., -1, :, :]
+    xp = samples.__array_namespace__()
+    diverged = _diverged(samples, 2) | _diverged(tilts, 1) | _diverged(angles, 2)
+    at_targets = kinematics.joint_angles(robot, memory.heights)
+    samples = xp.where(diverged[..., None, None], memory.imu[..., -1:, :], samples)
+    tilts = xp.where(diverged[..., None], task.fail_tilt, tilts)
+    angles = xp.where(diverged[..., None, None], at_targets, angles)
+    terminated = diverged | failed(task, tilts).any(axis=-1)
+    after = tilts.mean(axis=-1) if task.reward_tilt == "mean" else tilts[..., -1]
+    inputs = RewardInputs(memory.tilt, after, terminated.astype(after.dtype))
+    rewards = reward_terms(task, inputs)
+    memory = memory._replace(imu=extend_history(memory.imu, samples), tilt=after)
+    obs = observation(task, robot, memory, angles)
+    return memory, Outcome(obs, rewards, samples, tilts, terminated, diverged)
+
+
+def _diverged(values: Array, axes: int) -> Array:
+    """(...) whether any value over the last `axes` axes is NaN or `DIVERGED` or more."""
+    bad = ~(abs(values) < DIVERGED)
+    return bad.reshape(*values.shape[:-axes], -1).any(axis=-1)
+
+
+def observation(task: TaskConfig, robot: Robot, memory: Memory, angles: Array) -> Array:
+    """The network's input (..., obs_size), for measured joint angles (..., legs, 3), rad."""
+    heights = kinematics.foot_heights(robot, angles)
+    signals = Signals(heights[..., None, :], memory.commanded, memory.imu)
+    return observe(input_rows(task, robot), signals)
+
+
+def _repeated(row: Array, times: int) -> Array:
+    """Returns (..., times, k) for (..., k)."""
+    xp = row.__array_namespace__()
+    return xp.zeros((*row.shape[:-1], times, 1), row.dtype) + row[..., None, :]
