@@ -236,12 +236,12 @@ def keep_metrics_until(path: Path, env_steps: int) -> None:
     """Drops the lines of metrics that a resumed run will write again, and incomplete lines."""
     if not path.is_file():
         return
-    kept = []
+    lines = []
     for text in path.read_text(errors="replace").splitlines():
         with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
             if json.loads(text)["env_steps"] <= env_steps:
-                kept.append(f"{text}\n")
-    write_atomically(path, "".join(kept))
+                lines.append(f"{text}\n")
+    write_atomically(path, "".join(lines))
 
 
 def keep_validated_until(directory: Path, env_steps: int) -> None:

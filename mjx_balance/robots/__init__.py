@@ -1,1 +1,1 @@
-"""Robots: their files, and what follows from them."""
+"""Robots: TOML files, and the bodies and numbers that are built from them."""

@@ -1,7 +1,7 @@
-"""From a robot's file to its body, ready to stand on the board.
+"""Builds a robot's body from its file, ready to attach to the scene.
 
-Whatever a maker's model brings of actuators, sensors, contacts, keyframes and surroundings is
-left out; in their place come position servos, an IMU and four spheres as feet.
+Actuators, sensors, contacts, keyframes and surroundings of the maker's model are removed, and
+position servos, an IMU and four foot spheres are added.
 """
 
 import importlib.util
@@ -21,26 +21,30 @@ VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
 IMU = "balance_imu"
 BOARD_SIZE = "board_size"
-"""Number in the body's model: `RobotFile.board_size`, for the scene to be built by."""
-ALIKE = 1e-4
-"""What feet's radii may differ by, m."""
+"""Name of the model's numeric element with `RobotFile.board_size`."""
+RADIUS_TOLERANCE = 1e-4
+"""Greatest difference between the radii of the feet, m."""
 
 
 def scene_dir() -> Path:
-    """Folder of our MJCF files: in the installed package, or beside it in a checkout."""
+    """Returns the folder of our MJCF files, in the package or, in a checkout, beside it."""
     package = Path(__file__).resolve().parent.parent
     installed = package / "scenes"
     return installed if installed.is_dir() else package.parent / "scenes"
 
 
 def model_path(model: str, folder: Path) -> Path:
-    """Finds a model file; see `RobotFile.model`.
+    """Finds a model file.
+
+    Args:
+      model: `RobotFile.model`.
+      folder: folder that a relative path starts from.
 
     Raises:
       RobotError: if there is none.
     """
     where, colon, inside = model.partition(":")
-    if not colon or len(where) == 1:  # a drive's letter
+    if not colon or len(where) == 1:  # no prefix, or the letter of a Windows drive
         path = folder / model
     elif where == "scenes":
         path = scene_dir() / inside
@@ -57,7 +61,7 @@ def _package(name: str, model: str) -> Path:
     """Folder of an installed Python package."""
     try:
         spec = importlib.util.find_spec(name)
-    except (ImportError, ValueError):  # of a package that is not there; of no package's name
+    except (ImportError, ValueError):  # its parent package is missing; it is no package name
         spec = None
     if spec is None or not spec.submodule_search_locations:
         raise RobotError(
@@ -83,18 +87,18 @@ def _menagerie(name: str) -> Path:
 
 
 def read_model(path: Path) -> mujoco.MjSpec:
-    """Reads a model file, to be compiled as it is written: nothing is dropped or fused on the way.
+    """Reads a model file; no visual geom is discarded and no static body is fused.
 
-    A URDF's root gets the free joint that such files rarely have.
+    The root of a URDF gets a free joint if it has no joint.
 
     Raises:
-      RobotError: with MuJoCo's own words.
+      RobotError: with MuJoCo's message.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise RobotError(f"{path} cannot be read: {words(error)}") from error
-    spec.compiler.discardvisual = spec.compiler.fusestatic = False  # a URDF's are true
+        raise RobotError(f"{path} cannot be read: {mujoco_message(error)}") from error
+    spec.compiler.discardvisual = spec.compiler.fusestatic = False  # True by default for URDF
     if path.suffix.lower() == ".urdf":
         for root in spec.worldbody.bodies:
             if not root.joints:
@@ -102,21 +106,24 @@ def read_model(path: Path) -> mujoco.MjSpec:
     return spec
 
 
-def words(error: Exception) -> str:
-    """MuJoCo's, in one line: those after the first name the element."""
+def mujoco_message(error: Exception) -> str:
+    """MuJoCo's error message in one line; its later lines name the element."""
     lines = (line.strip() for line in str(error).splitlines())
     return shorten("; ".join(line for line in lines if line), MESSAGE)
 
 
 def build(file: RobotFile, visual: bool = False) -> tuple[mujoco.MjSpec, Robot]:
-    """The robot's body, its trunk's frame at the origin with x forward, and its numbers.
+    """Builds a robot.
 
     Args:
-      file: what is known of it.
-      visual: whether to keep the geoms that are only looked at.
+      file: the robot's file.
+      visual: whether to keep the visual geoms.
+
+    Returns:
+      The body, its trunk's frame at the origin with x forward, and the robot's numbers.
 
     Raises:
-      RobotError: if file and model do not fit together, or make no robot of this kind.
+      RobotError: if file and model do not match, or the model is no four-legged robot.
     """
     try:
         return _build(file, visual)
@@ -137,8 +144,8 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     spheres = _spheres(spec, feet, radius)
     names = [sphere.name for sphere in spheres]
     _leave_geoms(spec, trunk, spheres, visual)
-    # A foot on a body of its own, with no joint, would slide more: MuJoCo sets friction's softness
-    # by what it takes a contact's body for, the light tip of a leg or all of its calf.
+    # MuJoCo scales the softness of friction with the weight of the body in contact. A foot on a
+    # light body of its own, without a joint, would slide more than one on the calf.
     spec.fuse_static()
     bare = _compiled(spec)
     check_joints(bare, file)
@@ -152,7 +159,7 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
 
 
 def _remedy(trunk: mujoco.MjsBody) -> str:
-    """What to do about a trunk that is not free."""
+    """The end of the message that the trunk has no free joint."""
     root = trunk
     while root.parent.name != "world":
         root = root.parent
@@ -165,7 +172,7 @@ def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise RobotError(f"its model cannot be compiled: {words(error)}") from error
+        raise RobotError(f"its model cannot be compiled: {mujoco_message(error)}") from error
 
 
 def _find(elements: list, name: str, what: str, kind: str):
@@ -177,8 +184,8 @@ def _find(elements: list, name: str, what: str, kind: str):
 
 
 def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
-    """Removes what the file asks for, and everything around the robot."""
-    bodies, joints = _stripped(spec, trunk, file)
+    """Removes what the file strips, and everything but the robot's bodies, joints and geoms."""
+    bodies, joints = _strip_elements(spec, trunk, file)
     gone = {joint.name for body in bodies for joint in _joints_below(body)}
     gone |= {joint.name for joint in joints}
     for leg in file.legs:
@@ -189,7 +196,7 @@ def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
     usual = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
     for actuator in [a for a in spec.actuators if a.trntype not in usual or a.target in gone]:
         spec.delete(actuator)
-    # What refers to others goes before them.
+    # Elements that refer to others are deleted before those.
     refer = [*spec.keys, *spec.sensors, *spec.excludes, *spec.pairs, *spec.equalities]
     refer += [*spec.tuples, *spec.numerics, *spec.texts, *spec.tendons, *spec.skins, *spec.flexes]
     for element in (*refer, *joints):
@@ -206,10 +213,10 @@ def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
         setattr(spec, size, getattr(fresh, size))
 
 
-def _stripped(
+def _strip_elements(
     spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile
 ) -> tuple[list[mujoco.MjsBody], list[mujoco.MjsJoint]]:
-    """Bodies and joints that the file wants gone, none of them below one of the bodies."""
+    """The outermost bodies that the file strips, and the joints that none of them carries."""
     carries, body = {"world"}, trunk
     while body.name != "world":
         carries.add(body.name)
@@ -232,57 +239,59 @@ def _stripped(
 
 
 def _joints_below(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
-    """Of a body and of all that hangs on it."""
+    """Joints of a body and of its descendants."""
     return [j for x in (body, *body.find_all(mujoco.mjtObj.mjOBJ_BODY)) for j in x.joints]
 
 
-class _Found(NamedTuple):
-    """A foot in its model."""
+class _FootPlace(NamedTuple):
+    """Where the model has a foot."""
 
     body: mujoco.MjsBody
     pos: tuple[float, float, float]
-    """In the body's frame, m; of a geom or a site only its compiled model knows."""
+    """In the body's frame, m; unused with `element`, whose place the compiled model knows."""
     element: mujoco.MjsGeom | mujoco.MjsSite | None
-    """The geom or site, if it is one."""
+    """The geom or site that the file names."""
 
     @property
     def sphere(self) -> mujoco.MjsGeom | None:
-        """The geom, if it is a sphere."""
         geom = self.element if isinstance(self.element, mujoco.MjsGeom) else None
         return geom if geom and geom.type == mujoco.mjtGeom.mjGEOM_SPHERE else None
 
 
-def _foot(spec: mujoco.MjSpec, foot: str | Foot, leg: str) -> _Found:
+def _foot(spec: mujoco.MjSpec, foot: str | Foot, leg: str) -> _FootPlace:
     origin = (0.0, 0.0, 0.0)
     if isinstance(foot, Foot):
         body = _find(spec.bodies[1:], foot.body, f"foot of leg {leg}", "bodies")
-        return _Found(body, foot.offset, None)
+        return _FootPlace(body, foot.offset, None)
     for element in (*spec.geoms, *spec.sites):
         if element.name == foot:
-            return _Found(element.parent, origin, element)
+            return _FootPlace(element.parent, origin, element)
     for body in spec.bodies:
         if body.name == foot:
-            return _Found(body, origin, None)
+            return _FootPlace(body, origin, None)
     raise RobotError(
         f"foot of leg {leg} is {quote(foot)}, which is no geom, site or body of its model"
     )
 
 
-def _foot_radius(file: RobotFile, feet: dict[str, _Found]) -> float:
+def _foot_radius(file: RobotFile, feet: dict[str, _FootPlace]) -> float:
     if file.foot_radius is not None:
         return file.foot_radius
     sizes = {name: float(x.sphere.size[0]) for name, x in feet.items() if x.sphere is not None}
     missing = [name for name in feet if name not in sizes]
     if missing:
         raise RobotError(f"foot of leg {missing[0]} is not a sphere geom; say foot_radius, in m")
-    if max(sizes.values()) - min(sizes.values()) > ALIKE:
+    if max(sizes.values()) - min(sizes.values()) > RADIUS_TOLERANCE:
         listed = ", ".join(f"{name} {size:.4g}" for name, size in sizes.items())
         raise RobotError(f"the feet have different radii, {listed}; say foot_radius, in m")
     return next(iter(sizes.values()))
 
 
 def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
-    """Writes down what bodies get from geoms, which may go, and from the compiler's options."""
+    """Makes explicit the inertia that bodies get from their geoms and from compiler options.
+
+    The geoms may be deleted later.
+    """
     bodies = [trunk, *trunk.find_all(mujoco.mjtObj.mjOBJ_BODY)]
     compiler = spec.compiler
     by_geoms = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
@@ -302,8 +311,10 @@ def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
     compiler.balanceinertia = False
 
 
-def _spheres(spec: mujoco.MjSpec, feet: dict[str, _Found], radius: float) -> list[mujoco.MjsGeom]:
-    """Of each leg, the foot's own sphere, or a new one in its place."""
+def _spheres(
+    spec: mujoco.MjSpec, feet: dict[str, _FootPlace], radius: float
+) -> list[mujoco.MjsGeom]:
+    """The sphere of each foot: the model's if its radius fits, else a new one."""
     own = {
         name: foot.sphere
         for name, foot in feet.items()
@@ -311,7 +322,7 @@ def _spheres(spec: mujoco.MjSpec, feet: dict[str, _Found], radius: float) -> lis
     }
     places = {name: foot.pos for name, foot in feet.items()}
     drawn = {name: x.element for name, x in feet.items() if x.element and name not in own}
-    if drawn:  # frames, ends and meshes decide where they are
+    if drawn:  # only the compiled model knows where these are
         model = _compiled(spec)
         for name, element in drawn.items():
             geom = isinstance(element, mujoco.MjsGeom)
@@ -320,8 +331,8 @@ def _spheres(spec: mujoco.MjSpec, feet: dict[str, _Found], radius: float) -> lis
     for name, foot in feet.items():
         sphere = own.get(name)
         if sphere is None:
-            sphere = foot.body.add_geom(name=_unused(spec.geoms, f"{name}_contact"))
-            _as_new(sphere, mujoco.MjSpec().worldbody.add_geom())
+            sphere = foot.body.add_geom(name=_free_name(spec.geoms, f"{name}_contact"))
+            _reset_defaults(sphere, mujoco.MjSpec().worldbody.add_geom())
             sphere.type = mujoco.mjtGeom.mjGEOM_SPHERE
             sphere.pos, sphere.size, sphere.mass = places[name], [radius, 0, 0], 0
             sphere.rgba = [0, 0, 0, 0]
@@ -329,20 +340,20 @@ def _spheres(spec: mujoco.MjSpec, feet: dict[str, _Found], radius: float) -> lis
     return spheres
 
 
-def _unused(elements: list, name: str) -> str:
-    """A name that none of them has."""
+def _free_name(elements: list, name: str) -> str:
+    """`name`, with underscores added until no element has it."""
     names = {element.name for element in elements}
     while name in names:
         name += "_"
     return name
 
 
-def _as_new(element: Any, fresh: Any) -> None:
-    """Takes back what its maker's defaults say of an element.
+def _reset_defaults(element: Any, fresh: Any) -> None:
+    """Replaces the values that a new element took from the model's default class.
 
     Args:
-      element: a geom, site or actuator that was just added.
-      fresh: one of an empty model.
+      element: a new geom, site or actuator.
+      fresh: a new one of an empty model, with MuJoCo's defaults.
     """
     for field in dir(fresh):
         value = getattr(fresh, field)
@@ -356,20 +367,24 @@ def _as_new(element: Any, fresh: Any) -> None:
 def _leave_geoms(
     spec: mujoco.MjSpec, trunk: mujoco.MjsBody, feet: list[mujoco.MjsGeom], visual: bool
 ) -> None:
-    """Leaves the feet, which only the board touches, and what is looked at, if wanted."""
-    kept = {x.name for x in feet}
-    others = [g for g in spec.geoms if g.name not in kept]
+    """Deletes all geoms but the feet and, with `visual`, those that show the robot.
+
+    Without visual geoms in the model, the collision geoms show it. No geom that is left collides by
+    itself: contact pairs join the feet and the board.
+    """
+    own = {x.name for x in feet}
+    others = [g for g in spec.geoms if g.name not in own]
     solid = [g for g in others if g.contype or g.conaffinity]
     looks = [g for g in others if not (g.contype or g.conaffinity)]
-    shown = (looks or solid) if visual else []
+    visible = (looks or solid) if visual else []
     for geom in (*looks, *solid) if not visual else solid if looks else ():
         spec.delete(geom)
-    for geom in (*shown, *feet):
+    for geom in (*visible, *feet):
         geom.contype = geom.conaffinity = 0
         geom.mass = 0
     for geom in feet:
         geom.group = FOOT_GROUP
-    for geom in shown:
+    for geom in visible:
         geom.group = VISUAL_GROUP
     if not visual:
         for element in (*feet, *spec.sites):
@@ -381,10 +396,10 @@ def _leave_geoms(
 def _align(
     spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file: RobotFile
 ) -> bool:
-    """Puts the trunk at the origin and turns what it carries, so that x is forward.
+    """Moves the trunk to the origin, and turns its contents by quarter turns to make x forward.
 
-    Forward is from the hind hips to the front ones; where the file does not tell them apart,
-    the longer side of the hips' rectangle, toward positive x or y.
+    Forward is from the hind hips to the front ones. If the file does not name the ends, it is the
+    longer side of the hips' rectangle, toward positive x or y.
 
     Returns:
       Whether anything was turned.
@@ -428,7 +443,7 @@ def _align(
 
 
 def _check_ends(file: RobotFile, hips: dict[str, np.ndarray], pose: Pose) -> None:
-    """Front legs stand at one end, hind legs at the other: the ends that abductions turn about."""
+    """Checks that the front legs stand at one end of the trunk, along the abductions' axis."""
     turns = [np.abs(pose.axis(leg.joints[0])[:2]) for leg in file.legs]
     along = int(np.argmax(np.sum(turns, axis=0)))
     middle = np.mean(list(hips.values()), axis=0)[along]
@@ -441,7 +456,7 @@ def _check_ends(file: RobotFile, hips: dict[str, np.ndarray], pose: Pose) -> Non
 
 
 def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
-    """Gives the robot its servos and its IMU."""
+    """Adds servos and IMU, and removes passive joint forces other than the servos' damping."""
     for element in [*spec.actuators]:
         spec.delete(element)
     for body in spec.bodies:
@@ -457,12 +472,10 @@ def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
         torques = (robot.hip_torque, robot.hip_torque, robot.knee_torque)
         for name, torque in zip(leg.joints, torques, strict=True):
             servo = spec.add_actuator(name=name)
-            _as_new(servo, mujoco.MjSpec().add_actuator())
+            _reset_defaults(servo, mujoco.MjSpec().add_actuator())
             servo.target, servo.trntype = name, mujoco.mjtTrn.mjTRN_JOINT
-            servo.forcelimited, servo.forcerange = (
-                mujoco.mjtLimited.mjLIMITED_TRUE,
-                [-torque, torque],
-            )
+            servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            servo.forcerange = [-torque, torque]
             servo.set_to_position(kp=robot.servo_stiffness)
     for name, kind in (
         (GYRO, mujoco.mjtSensor.mjSENS_GYRO),
@@ -472,7 +485,7 @@ def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
 
 
 def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file: RobotFile) -> str:
-    """Name of a site on the trunk with x forward, y left, z up."""
+    """Name of the IMU's site on the trunk, with x forward, y left, z up; adds it if needed."""
     place = np.asarray(file.imu if isinstance(file.imu, tuple) else (0.0, 0.0, 0.0))
     if isinstance(file.imu, str):
         _find(spec.sites, file.imu, "imu", "sites")
@@ -483,7 +496,7 @@ def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file
         if np.allclose(site.quat, (1, 0, 0, 0)):
             return site.name
         place = site.pos
-    added = trunk.add_site(name=_unused(spec.sites, IMU))
-    _as_new(added, mujoco.MjSpec().worldbody.add_site())
-    added.pos = place
-    return added.name
+    new = trunk.add_site(name=_free_name(spec.sites, IMU))
+    _reset_defaults(new, mujoco.MjSpec().worldbody.add_site())
+    new.pos = place
+    return new.name

@@ -1,4 +1,4 @@
-"""The robots that can be trained: shipped ones by name, others by their TOML file."""
+"""Finds robots: shipped ones by name, Menagerie's by `menagerie:NAME`, others by TOML file."""
 
 import functools
 from pathlib import Path
@@ -34,23 +34,23 @@ MENAGERIE = "menagerie:"
 
 
 def shipped() -> list[str]:
-    """Names of the robots whose files are part of this package."""
+    """Returns the names of the robots whose files are part of this package."""
     return sorted(path.stem for path in SHIPPED.glob("*.toml"))
 
 
 def robot_file(name: str) -> RobotFile:
-    """What is known of the robot that `config.robot` calls `name`.
+    """Reads or drafts the file of a robot.
 
     Args:
-      name: a shipped robot's; the path of a TOML file; or `menagerie:NAME`.
+      name: as `Config.robot`: a shipped robot's name, the path of a TOML file, or `menagerie:NAME`.
 
     Raises:
-      RobotError: if there is none, or its file is wrong.
+      RobotError: if there is none, or its file is invalid.
     """
     if name.endswith(".toml"):
         return read_robot_file(Path(name))
     if name.startswith(MENAGERIE):
-        return _drafted(name)
+        return _draft_file(name)
     if name not in shipped():
         raise RobotError(
             f"robot is {quote(name)}; known robots: {', '.join(shipped())}; or menagerie:NAME, or "
@@ -60,28 +60,43 @@ def robot_file(name: str) -> RobotFile:
 
 
 @functools.lru_cache(maxsize=8)
-def _drafted(model: str) -> RobotFile:
+def _draft_file(model: str) -> RobotFile:
     return parse_robot_file(draft(model, model_path(model, Path())), Path(model))
 
 
 def robot_spec(name: str, visual: bool = False) -> mujoco.MjSpec:
-    """A robot's body (`building.build`), new each time: whoever attaches it owns it."""
+    """Returns a new robot body for a scene to attach.
+
+    Args:
+      name: as for `robot_file`.
+      visual: whether to keep the visual geoms.
+
+    Raises:
+      RobotError: as `robot_file` and `build.build`.
+    """
     return build(robot_file(name), visual)[0]
 
 
 def robot_xml(name: str) -> str:
-    """What `robot_spec` gives, as MJCF without looks: equal for equal bodies."""
+    """Returns a robot's body without visual geoms as MJCF; equal bodies give equal text."""
     spec = robot_spec(name)
     spec.compile()
     return spec.to_xml()
 
 
 def find_robot(name: str) -> Robot:
-    """A robot's numbers; raises as `robot_file` and `building.build`."""
+    """Returns a robot's numbers; cached while its file and model stay the same.
+
+    Args:
+      name: as for `robot_file`.
+
+    Raises:
+      RobotError: as `robot_file` and `build.build`.
+    """
     file = robot_file(name)
-    return _measured(file, model_path(file.model, file.folder).stat().st_mtime_ns)
+    return _build_robot(file, model_path(file.model, file.folder).stat().st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=64)
-def _measured(file: RobotFile, _: int) -> Robot:
+def _build_robot(file: RobotFile, _: int) -> Robot:
     return build(file)[1]

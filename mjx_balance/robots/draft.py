@@ -1,4 +1,4 @@
-"""A first TOML file for a robot, from its model alone: legs are found by their structure."""
+"""Drafts a robot's TOML file from its model; legs are recognised by their kinematic structure."""
 
 import itertools
 import json
@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.files.text import quote
-from mjx_balance.robots.build import ALIKE, read_model, words
+from mjx_balance.robots.build import RADIUS_TOLERANCE, mujoco_message, read_model
 from mjx_balance.robots.measure import ancestors
 from mjx_balance.robots.schema import RobotError, parse_robot_file
 
@@ -19,61 +19,62 @@ HEADER = """\
 # `mjx-balance robot check FILE` builds it, says what it found, and draws a picture.
 """
 USUAL_RADIUS = 0.02
-"""Of a foot that is no sphere, m."""
-REACHES = 0.85
-"""Share of its calf's length from which a sphere or a site is the foot, and no ornament."""
+"""Radius of a foot that is no sphere, m."""
+MIN_REACH = 0.85
+"""Least distance of a foot from the knee, as a share of the calf's length; a sphere or site that
+is nearer is no foot."""
 CORNERS = {"FL": "front left", "FR": "front right", "RL": "rear left", "RR": "rear right"}
 
 
 class _Chain(NamedTuple):
-    """Three hinges, one below the other, and nothing else that moves."""
+    """Three hinges on three nested bodies, with no other joint on them."""
 
     joints: tuple[int, int, int]
     calf: list[int]
-    """The body that the last of them moves, and what is fixed to it."""
+    """The body of the last joint, and the bodies fixed to it."""
 
 
 class _Foot(NamedTuple):
-    """Where a chain ends."""
+    """The foot of a chain."""
 
     text: str
-    """As the file says it."""
+    """Value of `foot` in the file, TOML."""
     place: np.ndarray
     """(3,) in the world, m."""
     radius: float
     """m"""
     sphere: bool = False
-    """Whether the geom that the file names says how large it is."""
+    """Whether `text` names a sphere geom, which gives the radius."""
 
 
 def draft(model: str, path: Path) -> str:
-    """A robot file's text.
+    """Returns the text of a robot file.
 
     Args:
-      model: what the file calls the model.
-      path: where the model is.
+      model: value of `model` in the file.
+      path: path of the model.
 
     Raises:
-      RobotError: if it cannot be read, has no free trunk or not a leg at each corner, or a joint
-        without a name.
+      RobotError: if the model cannot be read, its trunk is not free, a corner has no leg or two,
+        or a joint has no name.
     """
     spec = read_model(path)
     try:
         compiled = spec.compile()
     except ValueError as error:
-        raise RobotError(f"{path} cannot be compiled: {words(error)}") from error
+        raise RobotError(f"{path} cannot be compiled: {mujoco_message(error)}") from error
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
     trunk = _trunk(compiled, path)
-    found = [(chain, _foot(compiled, data, chain)) for chain in _chains(compiled, trunk)]
-    legs = sorted(found, key=lambda leg: leg[1].place[2])[:4]
+    candidates = [(chain, _foot(compiled, data, chain)) for chain in _chains(compiled, trunk)]
+    legs = sorted(candidates, key=lambda leg: leg[1].place[2])[:4]
     if len(legs) < 4:
         names = ", ".join(compiled.joint(chain.joints[0]).name for chain, _ in legs) or "none"
         raise RobotError(
             f"{path} has {len(legs)} chains of three hinges below its trunk ({names}); a robot of "
             "this kind has four legs"
         )
-    text = _written(compiled, data, model, trunk, legs)
+    text = _render(compiled, data, model, trunk, legs)
     parse_robot_file(text, path)
     return text
 
@@ -106,19 +107,16 @@ def _chains(model: mujoco.MjModel, trunk: int) -> list[_Chain]:
 
 
 def _foot(model: mujoco.MjModel, data: mujoco.MjData, chain: _Chain) -> _Foot:
-    """The sphere, or else the site, or else the point of a geom, that is furthest from the knee.
-
-    A sphere or site that the calf clearly reaches beyond is no foot.
-    """
+    """The sphere furthest from the knee, else the furthest site, else the furthest geom point."""
     knee = data.xanchor[chain.joints[2]]
 
     def distance(place: np.ndarray) -> float:
         return float(np.linalg.norm(place - knee))
 
     geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in chain.calf]
-    corners = [p for g in geoms for p in _corners(model, data, g)]
-    furthest = max(corners or [data.xpos[chain.calf[-1]]], key=distance)
-    enough = REACHES * distance(furthest)
+    points = [p for g in geoms for p in _points(model, data, g)]
+    furthest = max(points or [data.xpos[chain.calf[-1]]], key=distance)
+    enough = MIN_REACH * distance(furthest)
     spheres = [g for g in geoms if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_SPHERE]
     spheres = [g for g in spheres if distance(data.geom_xpos[g]) >= enough]
     if spheres:
@@ -137,8 +135,8 @@ def _foot(model: mujoco.MjModel, data: mujoco.MjData, chain: _Chain) -> _Foot:
     return _Foot(_offset(model, data, chain.calf[0], place), place, USUAL_RADIUS)
 
 
-def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> list[np.ndarray]:
-    """Points in the world, m: a mesh's vertices, or else of the box around a geom its faces'."""
+def _points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> list[np.ndarray]:
+    """A mesh's vertices, or the face centres of another geom's bounding box, in the world, m."""
     turn, centre = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
     mesh = int(model.geom_dataid[geom])
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH and mesh >= 0:
@@ -158,20 +156,20 @@ def _offset(model: mujoco.MjModel, data: mujoco.MjData, body: int, place: np.nda
 
 
 def _name(name: str, what: str) -> str:
-    """As TOML writes it."""
+    """A name as a TOML string."""
     if not name:
         raise RobotError(f"{what} has no name; give it one in its model, for the file to use")
     return json.dumps(name, ensure_ascii=False)
 
 
 def _joints(model: mujoco.MjModel, joints: Iterable[int]) -> str:
-    """Their names, as TOML writes a list."""
+    """Names of joints as a TOML array."""
     holders = {k: model.body(int(model.jnt_bodyid[k])).name for k in joints}
     names = [_name(model.joint(k).name, f"a joint of body {quote(holders[k])}") for k in holders]
     return f"[{', '.join(names)}]"
 
 
-def _written(
+def _render(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     name: str,
@@ -207,7 +205,7 @@ def _written(
             f"strip = {_joints(model, fixed)}  # fixed; a body's name instead leaves it out"
         )
     radii = [foot.radius for _, foot in legs]
-    if max(radii) - min(radii) > ALIKE or not all(foot.sphere for _, foot in legs):
+    if max(radii) - min(radii) > RADIUS_TOLERANCE or not all(foot.sphere for _, foot in legs):
         lines.append(f"foot_radius = {max(radii):.4g}")
     for corner in CORNERS:
         chain, foot = corners[corner]

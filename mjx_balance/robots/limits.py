@@ -1,4 +1,4 @@
-"""Where config and robot meet: a config made for a robot, and whether it suits it."""
+"""Config and robot together: adapts a config to a robot, and checks it against the robot."""
 
 import dataclasses
 import math
@@ -9,14 +9,14 @@ from mjx_balance.robots.robot import Robot
 
 
 def for_robot(config: Config, robot: str) -> Config:
-    """Returns `config`, of our own robot, made for another one.
+    """Adapts a config of our own robot to another robot.
 
-    Standing height and greatest height change are the robot's own (`robots.measure`), loads follow
-    its mass and size. Angles, the board's rate and the fall limit stay the paper's. To replace
-    `robot` alone leaves the robot with the height, the height changes and the loads of another.
+    Standing height and greatest height change become the robot's (`robots.measure`). Payloads scale
+    with its mass; pushes, offsets and the scale of foot heights with its size. Angles, board rate
+    and fall limit stay.
 
     Args:
-      config: of our own robot.
+      config: for our own robot.
       robot: as `Config.robot`.
 
     Raises:
@@ -34,7 +34,7 @@ def for_robot(config: Config, robot: str) -> Config:
 
 
 def scale_ranges(ranges: RandomizationConfig, robot: Robot) -> RandomizationConfig:
-    """Scales loads by the robot's mass, their places and the speeds of pushes by its size."""
+    """Scales payloads with the robot's mass, their offsets and push speeds with its size."""
     return dataclasses.replace(
         ranges,
         payload=ranges.payload * robot.mass_scale,
@@ -46,25 +46,29 @@ def scale_ranges(ranges: RandomizationConfig, robot: Robot) -> RandomizationConf
 
 
 def greatest_incline(task: TaskConfig, robot: Robot) -> float:
-    """Board angle on both axes at once that the legs' stroke can follow, deg."""
+    """Greatest board angle, on both axes at once, that the legs can compensate, deg."""
     lowest, highest = robot.height_range
     room = min(highest - task.body_height, task.body_height - lowest)
     return math.degrees(math.atan(room / (robot.half_length + robot.half_track)))
 
 
 def authority(task: TaskConfig, robot: Robot) -> float:
-    """Greatest board speed that the action set can follow on both axes, deg/s.
+    """Greatest board rate that the actions can follow on both axes, deg/s.
 
-    `action_max` per decision over the longer of the two half-tracks, fore-aft.
+    It is `action_max` per decision over the robot's lever.
     """
     return math.degrees(task.action_max / task.ctrl_dt / robot.lever)
 
 
 def check_robot(config: Config, robot: Robot) -> Config:
-    """Returns `config`, which `config.check` has passed, if the robot can do what it asks for.
+    """Returns `config` if the robot can do what it demands.
+
+    Args:
+      config: from `config.check`.
+      robot: the numbers of `config.robot`.
 
     Raises:
-      ConfigError: one sentence that names the field, its value and the robot.
+      ConfigError: names the field, its value and the robot.
     """
     task, ranges = config.task, config.randomization
     lowest, highest = robot.height_range

@@ -1,4 +1,4 @@
-"""A robot's numbers, measured on its compiled model; what depends on its size follows from them."""
+"""Measures a robot on its compiled model, and scales servos, height and action to its size."""
 
 import dataclasses
 import itertools
@@ -11,43 +11,37 @@ import numpy as np
 
 from mjx_balance.files.text import quote
 from mjx_balance.files.validation import check_types
-from mjx_balance.robots.robot import (
-    OUR_LEVER,
-    OUR_MASS,
-    Body,
-    Leg,
-    Robot,
-)
+from mjx_balance.robots.robot import OUR_LEVER, OUR_MASS, Body, Leg, Robot
 from mjx_balance.robots.schema import LegFile, RobotError, RobotFile
 
 LEVEL = math.cos(math.radians(1.0))
-"""Cosine of what an axis may be off the one that the kinematics take it for."""
+"""Cosine of the greatest angle between a joint's axis and the trunk's axis."""
 
-# Our own robot's (robots/quadruped.toml), which is chosen; others' follow from it.
+# Numbers of our own robot (robots/quadruped.toml), from which others are scaled.
 OUR_LEG, OUR_HALF_TRACK, OUR_HEIGHT = 0.426, 0.142, 0.35
 OUR_STIFFNESS, OUR_DAMPING, OUR_ARMATURE = 400.0, 16.0, 0.02
 OUR_ACTION = 0.003  # paper Eq. 3
 STRETCH = 0.77
-"""Of the legs' length that they stand at: 0.35 m for ours (paper 3.1)."""
+"""Standing length of the legs as a share of their full length: 0.35 m for ours (paper 3.1)."""
 SMALLEST = 0.01
-"""Mass and size against ours that the board can still be made for."""
+"""Least mass and size relative to ours."""
 INCLINE = 7.0
-"""On both axes at once, deg, that the legs must be able to follow (paper 3.1)."""
+"""Board angle on both axes at once that the legs must compensate, deg (paper 3.1)."""
 
 
 def measure(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: float) -> Robot:
-    """Measures a robot, and sizes what its file leaves out.
+    """Measures a robot, and scales what its file leaves out to its mass and size.
 
     Args:
-      file: what is known of it.
+      file: the robot's file.
       model: compiled, x forward, with its maker's actuators.
-      feet: geom of each leg's foot.
+      feet: name of each leg's foot geom.
       radius: of the feet, m.
 
     Raises:
-      RobotError: if a leg is none that can be put on the board, or they are too short for it.
+      RobotError: if the kinematics of a leg do not fit, or the legs are too short for the board.
     """
-    legs = _placed([_leg(file, model, *one) for one in zip(file.legs, feet, strict=True)])
+    legs = _with_corners([_leg(file, model, *one) for one in zip(file.legs, feet, strict=True)])
     _check_corners(file, legs)
     _check_bends(file, legs)
     trunk = model.body(file.trunk)
@@ -66,24 +60,28 @@ def measure(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: flo
             "needed for a board of its size"
         )
     height = file.body_height or _standing_height(body)
-    stiffer = _stiffer(body, height)
+    gain_scale = _gain_scale(body, height)
     robot = Robot(
         **vars(body),
         hip_torque=file.hip_torque or _torque(model, [x for leg in legs for x in leg.joints[:2]]),
         knee_torque=file.knee_torque or _torque(model, [leg.joints[2] for leg in legs]),
-        servo_stiffness=file.servo_stiffness or _digits(OUR_STIFFNESS * stiffer),
-        servo_damping=file.servo_damping or _digits(OUR_DAMPING * stiffer),
-        servo_armature=file.servo_armature or _digits(OUR_ARMATURE * stiffer),
+        servo_stiffness=file.servo_stiffness or _three_digits(OUR_STIFFNESS * gain_scale),
+        servo_damping=file.servo_damping or _three_digits(OUR_DAMPING * gain_scale),
+        servo_armature=file.servo_armature or _three_digits(OUR_ARMATURE * gain_scale),
         foot_friction=file.foot_friction,
         body_height=height,
-        action_max=file.action_max or _digits(OUR_ACTION * body.lever / OUR_LEVER),
+        action_max=file.action_max or _three_digits(OUR_ACTION * body.lever / OUR_LEVER),
     )
-    # A policy carries it: better refused now than when a training has ended.
+    # The policy file repeats this check, but only after the training.
     return check_types(robot, RobotError)
 
 
 def check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
-    """Every hinge belongs to a leg, and every leg is a chain that ends in its foot."""
+    """Checks that every leg is a chain of three hinges, and that no other joint is left.
+
+    Raises:
+      RobotError: names the first joint that does not fit.
+    """
     moving = [model.joint(k).name for k in range(model.njnt) if model.jnt_type[k] != 0]
     for leg in file.legs:
         name, above = leg.name, model.body(file.trunk).id
@@ -116,16 +114,16 @@ def check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
 
 
 def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
-    """The bodies that a body hangs on, without itself, up to the world."""
-    found = []
+    """Ids of a body's ancestors, from its parent up to the world."""
+    bodies = []
     while body:
         body = int(model.body_parentid[body])
-        found.append(body)
-    return found
+        bodies.append(body)
+    return bodies
 
 
 class Pose:
-    """The bare robot with given joint angles, seen from its trunk's frame."""
+    """Places and axes of a robot at given joint angles (rad), in its trunk's frame."""
 
     def __init__(self, model: mujoco.MjModel, trunk: str, angles: dict[str, float]):
         self.model, self.data = model, mujoco.MjData(model)
@@ -137,22 +135,22 @@ class Pose:
         mujoco.mj_kinematics(model, self.data)
 
     def anchor(self, joint: str) -> np.ndarray:
-        """Where it is, (3,) m."""
+        """Place of a joint's anchor, (3,) m."""
         return self.data.joint(joint).xanchor.copy()
 
     def axis(self, joint: str) -> np.ndarray:
-        """Its direction, (3,) unit."""
+        """Axis of a joint, (3,) unit vector."""
         return self.data.joint(joint).xaxis.copy()
 
     def foot(self, geom: str) -> np.ndarray:
-        """Where it is, (3,) m."""
+        """Place of a geom, (3,) m."""
         return self.data.geom(geom).xpos.copy()
 
 
 def _standing_height(robot: Body) -> float:
-    """Where its legs are at `STRETCH` of their length, m.
+    """Body height with the legs at `STRETCH` of their length, m.
 
-    Or as near to it as the joints and a board at `INCLINE` on both axes allow.
+    Clipped, so that the legs can compensate a board at `INCLINE` on both axes.
     """
     room = math.tan(math.radians(INCLINE)) * (robot.half_length + robot.half_track)
     low, high = robot.height_range
@@ -164,30 +162,29 @@ def _standing_height(robot: Body) -> float:
     stretched = [
         leg.drop - leg.axis_height + STRETCH * (leg.thigh + leg.calf) for leg in robot.legs
     ]
-    wanted = robot.foot_radius + float(np.mean(stretched))
-    return round(min(max(wanted, low + room), high - room), 3)
+    stance = robot.foot_radius + float(np.mean(stretched))
+    return round(min(max(stance, low + room), high - room), 3)
 
 
-def _stiffer(robot: Body, height: float) -> float:
-    """Servo gains against our own robot's.
+def _gain_scale(robot: Body, height: float) -> float:
+    """Servo gains relative to our own robot's.
 
-    Rolling is the softest of its motions: a mass m at a height h, on legs of a length l whose
-    feet are a half-track y from the middle, held by joints of a stiffness k, does so at a
-    frequency that goes with sqrt(k / m) * y / (l * h). It must have died out as early in a
-    decision as ours, whatever the size, for the gyro to read the board's own rate then.
+    Roll is the softest motion. A mass m at height h rolls on legs of length l and half-track y,
+    with joints of stiffness k, at a frequency proportional to sqrt(k / m) * y / (l * h). Every
+    robot gets the frequency of ours, so that its oscillation decays as early in a decision and the
+    gyro then reads the board's rate.
     """
     leg = float(np.mean([leg.thigh + leg.calf for leg in robot.legs]))
     longer = (leg * height / robot.half_track) / (OUR_LEG * OUR_HEIGHT / OUR_HALF_TRACK)
     return robot.total_mass / OUR_MASS * longer**2
 
 
-def _digits(value: float) -> float:
-    """To three significant digits: what follows from a rule is no more exact than the rule."""
+def _three_digits(value: float) -> float:
     return float(f"{value:.3g}")
 
 
 def _leg(file: RobotFile, model: mujoco.MjModel, leg: LegFile, foot: str) -> Leg:
-    """Measures a leg with the hip's axis level; `_placed` gives it its corner."""
+    """Measures a leg with the hip's axis level; `_with_corners` sets left and front."""
     _check_foot(model, leg, foot)
     pose, tilt, signs = _level_pose(model, file.trunk, leg)
     at, hip, knee = (pose.anchor(joint) for joint in leg.joints)
@@ -196,7 +193,7 @@ def _leg(file: RobotFile, model: mujoco.MjModel, leg: LegFile, foot: str) -> Leg
     lengths = [math.hypot(v[0], v[2]) for v in (thigh, calf)]
     lean, calf_lean = (math.atan2(-v[0], -v[2]) for v in (thigh, calf))
     zeros = (_clean(tilt), _clean(lean), _clean(math.remainder(calf_lean - lean, 2 * math.pi)))
-    ranges = [_turns(model, *one) for one in zip(leg.joints, signs, zeros, strict=True)]
+    ranges = [_range(model, *one) for one in zip(leg.joints, signs, zeros, strict=True)]
     bend = _bend(leg, ranges[1], ranges[2], lengths)
     whole = _level_turns(leg, ranges[0])
     return Leg(
@@ -238,7 +235,7 @@ def _level_pose(
     """Turns the abduction until the hip's axis is level.
 
     Returns:
-      The pose, the axis' angle off level as the model draws it, rad, and the joints' signs, +-1.
+      The pose, the roll of the hip's axis at joint angles 0, rad, and the joints' signs, +-1.
     """
     drawn = Pose(model, trunk, {})
     abduction, hip, knee = leg.joints
@@ -254,7 +251,7 @@ def _level_pose(
 
 
 def _sign(pose: Pose, leg: LegFile, joint: str, rule: str, along: int) -> float:
-    """Whether a joint's axis points along the trunk's x (0) or y (1), 1, or against it, -1."""
+    """1 if a joint's axis points along the trunk's x (`along` 0) or y (1), -1 if against it."""
     axis = pose.axis(joint)
     if abs(axis[along]) < LEVEL:
         ways = ("(1, 0, 0) or (-1, 0, 0)", "(0, 1, 0) or (0, -1, 0)")
@@ -265,8 +262,8 @@ def _sign(pose: Pose, leg: LegFile, joint: str, rule: str, along: int) -> float:
     return float(np.sign(axis[along]))
 
 
-def _placed(legs: list[Leg]) -> tuple[Leg, ...]:
-    """With their corners: a trunk's origin need not lie between its legs."""
+def _with_corners(legs: list[Leg]) -> tuple[Leg, ...]:
+    """Sets left and front relative to the legs' mean; the trunk's origin may lie outside."""
     x, y = (np.mean([getattr(leg, axis) for leg in legs]) for axis in "xy")
     return tuple(
         dataclasses.replace(leg, left=bool(leg.y > y), front=bool(leg.x > x)) for leg in legs
@@ -274,13 +271,13 @@ def _placed(legs: list[Leg]) -> tuple[Leg, ...]:
 
 
 FREE_KNEE = (0.1, 2.7)
-"""Turns of a knee that nothing stops, rad: short of straight, and of the thigh."""
+"""Least and greatest bend of a knee without limits, rad: almost straight, almost on the thigh."""
 WHOLE_TURNS = [2 * math.pi * k for k in (0, 1, -1, 2, -2)]
-"""By which a joint's angles may be drawn off, rad."""
+"""Offsets of a model's joint angles from ours, rad."""
 
 
-def _turns(model: mujoco.MjModel, joint: str, sign: float, zero: float) -> tuple[float, float]:
-    """What its limits let a joint turn the leg by, rad; infinite without limits."""
+def _range(model: mujoco.MjModel, joint: str, sign: float, zero: float) -> tuple[float, float]:
+    """Range of the turn of the leg by a joint (`Leg`), rad; infinite without limits."""
     one = model.joint(joint)
     if not model.jnt_limited[one.id]:
         return -math.inf, math.inf
@@ -289,7 +286,7 @@ def _turns(model: mujoco.MjModel, joint: str, sign: float, zero: float) -> tuple
 
 
 def _level_turns(leg: LegFile, turns: tuple[float, float]) -> float:
-    """Whole turns that bring the level hip's axis within an abduction's limits, rad."""
+    """Whole turns that bring the level hip axis, turn 0, within an abduction's limits, rad."""
     low, high = turns
     for whole in WHOLE_TURNS:
         if low + whole - SLACK <= 0 <= high + whole + SLACK:
@@ -302,37 +299,37 @@ def _level_turns(leg: LegFile, turns: tuple[float, float]) -> float:
 
 
 SLACK = 1e-3
-"""Of a limit that is level itself, rad."""
+"""Tolerance of an abduction's limits, rad."""
 
 
 class _Bend(NamedTuple):
-    """A knee that points one way."""
+    """The range of a knee that points one way."""
 
     low: float
     """Least turn of the calf against the thigh, rad; negative: backward."""
     high: float
-    """The greatest."""
+    """Greatest turn, rad."""
     hip: float
-    """Whole turns to add to the hip's angle for the thigh's turn, rad."""
+    """Whole turns to add to the hip's zero, rad."""
     calf: float
-    """Likewise to the knee's."""
+    """Whole turns to add to the knee's zero, rad."""
 
 
 def _bend(
     leg: LegFile, hip: tuple[float, float], knee: tuple[float, float], lengths: list[float]
 ) -> _Bend:
-    """Which way the knee points, and how far it turns within its limits and the hip's.
+    """Chooses which way the knee points.
 
-    Backward, unless forward has more than twice the room: limits that hardly differ say nothing,
-    and all legs should bend alike.
+    It points backward unless the file says otherwise or forward has more than twice the range: the
+    legs should bend alike even if their limits differ slightly.
 
     Args:
-      leg: may say it.
+      leg: the leg's table in the file.
       hip: least and greatest turn of the thigh, rad.
-      knee: of the calf against it, rad.
+      knee: least and greatest turn of the calf against the thigh, rad.
       lengths: of thigh and calf, m.
     """
-    backward, forward = (_bent(side, hip, knee, lengths) for side in (-1, 1))
+    backward, forward = (_bend_to(side, hip, knee, lengths) for side in (-1, 1))
     if leg.knee is not None:
         bend = forward if leg.knee == "forward" else backward
     elif backward and forward:
@@ -350,10 +347,13 @@ def _bend(
     return bend
 
 
-def _bent(
+def _bend_to(
     side: int, hip: tuple[float, float], knee: tuple[float, float], lengths: list[float]
 ) -> _Bend | None:
-    """The knee on one side, -1 backward or 1 forward; none: its limits, or the hip's, forbid it."""
+    """Range of a knee that points backward (-1) or forward (1), with the foot under the hip.
+
+    None if the limits of knee and hip leave no range.
+    """
     ends = (-math.pi, 0.0) if side < 0 else (0.0, math.pi)
 
     def room(whole: float) -> float:
@@ -374,12 +374,12 @@ def _bent(
         return turns[(leans >= hip[0] + whole) & (leans <= hip[1] + whole)]
 
     thigh = max(WHOLE_TURNS, key=lambda whole: len(good(whole)))
-    kept = good(thigh)
-    return _Bend(float(kept[0]), float(kept[-1]), thigh, calf) if len(kept) else None
+    usable = good(thigh)
+    return _Bend(float(usable[0]), float(usable[-1]), thigh, calf) if len(usable) else None
 
 
 def _clean(value: float) -> float:
-    """Without the last digits, which differ from machine to machine."""
+    """Drops the last digits, which differ between machines."""
     return round(float(value), 9) + 0.0
 
 
@@ -393,7 +393,7 @@ def _vector(v: np.ndarray) -> str:
 
 
 def _check_corners(file: RobotFile, legs: tuple[Leg, ...]) -> None:
-    """Each corner has one leg, which stands where the file says."""
+    """Checks that each corner has one leg, and that sides and ends are as the file says."""
     corners: dict[tuple[str, str], str] = {}
     for words, leg in zip(file.legs, legs, strict=True):
         side, end = "left" if leg.left else "right", "front" if leg.front else "hind"
@@ -408,12 +408,12 @@ def _check_corners(file: RobotFile, legs: tuple[Leg, ...]) -> None:
 
 
 def _check_bends(file: RobotFile, legs: tuple[Leg, ...]) -> None:
-    """Left and right legs are mirror images, or the file says that they are not."""
-    unsaid = {leg.name for leg in file.legs if leg.knee is None}
+    """Checks that knees of left and right legs point the same way, unless the file sets both."""
+    unset = {leg.name for leg in file.legs if leg.knee is None}
     for leg, other in itertools.product(legs, legs):
         mirrored = leg.front == other.front and leg.left and not other.left
         differ = sum(leg.knee) * sum(other.knee) < 0
-        if mirrored and differ and unsaid & {leg.name, other.name}:
+        if mirrored and differ and unset & {leg.name, other.name}:
             way = "forward" if sum(leg.knee) > 0 else "backward"
             raise RobotError(
                 f"knees of legs {leg.name} and {other.name} would point different ways, that "
@@ -422,11 +422,11 @@ def _check_bends(file: RobotFile, legs: tuple[Leg, ...]) -> None:
 
 
 UNLIMITED = 1e4
-"""Torque of servos that neither file nor model limit, N m."""
+"""Torque limit of servos if neither file nor model gives one, N m."""
 
 
 def _torque(model: mujoco.MjModel, joints: list[str]) -> float:
-    """What the model's own actuators can do at the weakest of some joints, N m."""
+    """Least torque limit of the model's actuators and joints over some joints, N m."""
     limits = [limit for joint in joints for limit in _limits(model, model.joint(joint).id)]
     return float(min(limits, default=UNLIMITED))
 

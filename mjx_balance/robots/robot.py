@@ -1,4 +1,4 @@
-"""A robot in numbers: what the task, the scene and a robot's own computer need to know of it."""
+"""The numbers of a robot that the task, the scene and the runtime use."""
 
 import dataclasses
 import math
@@ -10,19 +10,19 @@ from annotated_types import Ge, Le, Len
 from mjx_balance.files.validation import STRICT, parse
 
 MOST = 1e7
-"""Of any number of a robot, in its unit: what is greater has never walked."""
+"""Bound of a robot's numbers, in their units."""
 Number = Annotated[float, Ge(-MOST), Le(MOST)]
 OUR_MASS, OUR_LEVER = 15.2, 0.193
-"""Of our own robot, kg and m."""
+"""Mass and lever of our own robot, kg and m."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Leg:
-    """Three hinges and a foot, measured in the trunk's frame: x forward, y left, z up.
+    """Three hinges and a foot, in the trunk's frame: x forward, y left, z up.
 
-    A joint's angle q turns the leg by `sign * q + zero`: the abduction about x from where the
-    hip's axis is level, the thigh about y from hanging straight down, the knee about y from
-    straight. The foot is kept under the hip, in the plane that hip and knee move in.
+    A joint angle q turns the leg by `sign * q + zero`: the abduction about x, 0 with the hip's axis
+    level; the hip about y, 0 with the thigh hanging straight down; the knee about y, 0 with the leg
+    straight. The foot stands under the hip, in the plane of hip and knee.
     """
 
     __pydantic_config__ = STRICT
@@ -33,46 +33,47 @@ class Leg:
     joints: tuple[str, str, str]
     """Abduction, hip and knee; the scene's servos have the same names."""
     foot: str
-    """Sphere geom of the scene that touches the board."""
+    """Name of the foot's sphere geom in the scene."""
     x: Number
-    """Of the hip, and of the foot when it stands under it, m."""
+    """x of the hip, and of the foot under it, m."""
     y: Number
-    """Of the foot, m."""
+    """y of the foot, m."""
     axis_height: Number
     """z of the abduction's axis, m."""
     drop: Number
-    """From there down to the hip, m."""
+    """Distance from the abduction's axis down to the hip, m."""
     offset: Number
-    """From there to the left, to the plane of the foot, m."""
+    """Distance from the abduction's axis to the left, to the plane of the foot, m."""
     thigh: Number
-    """Hip to knee, m."""
+    """Length from hip to knee, m."""
     calf: Number
-    """Knee to the foot's centre, m."""
+    """Length from knee to the foot's centre, m."""
     signs: tuple[Number, Number, Number]
-    """Of abduction, hip and knee, +-1."""
+    """+-1, of abduction, hip and knee."""
     zeros: tuple[Number, Number, Number]
-    """rad"""
+    """Turns at joint angle 0, rad."""
     knee: tuple[Number, Number]
     """Least and greatest turn of the calf against the thigh, rad; negative: the knee points
     backward."""
 
     def height(self, knee: float) -> float:
-        """From the trunk's origin down to the foot's centre, for a turn of the knee, m."""
+        """Distance from the trunk's origin down to the foot's centre at a turn of the knee, m."""
         squared = self.thigh**2 + self.calf**2 + 2 * self.thigh * self.calf * math.cos(knee)
         return math.sqrt(squared) + self.drop - self.axis_height
 
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """Geometry and mass, measured on the compiled model; legs in observation order."""
+    """Geometry and mass, measured on the compiled model."""
 
     __pydantic_config__ = STRICT
 
     name: str
-    """Its file's."""
+    """The stem of the robot's file name."""
     legs: Annotated[tuple[Leg, ...], Len(4, 4)]
+    """In the order of the observation."""
     trunk: str
-    """The body that is kept level, on a free joint."""
+    """Name of the body to keep level; it has a free joint."""
     foot_radius: Number
     """m"""
     trunk_mass: Number
@@ -82,7 +83,7 @@ class Body:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the legs."""
+        """Names of the legs."""
         return tuple(leg.name for leg in self.legs)
 
     @property
@@ -97,7 +98,7 @@ class Body:
 
     @property
     def joints(self) -> tuple[tuple[str, str, str], ...]:
-        """Of each leg."""
+        """Joints of each leg."""
         return tuple(leg.joints for leg in self.legs)
 
     @property
@@ -112,34 +113,34 @@ class Body:
 
     @property
     def lever(self) -> float:
-        """Half of what the feet span, along or across, m: a height change turns the body by it."""
+        """Half of the feet's span, along x or y, whichever is longer, m."""
         return max(float(np.ptp(self.each(axis))) / 2 for axis in "xy")
 
     @property
     def height_range(self) -> tuple[float, float]:
-        """Least and greatest body height above a foot's contact point that all legs reach, m."""
+        """Least and greatest body height above the board that all legs reach, m."""
         ends = [sorted(map(leg.height, leg.knee)) for leg in self.legs]
         least, most = max(low for low, _ in ends), min(high for _, high in ends)
         return least + self.foot_radius, most + self.foot_radius
 
     @property
     def mass_scale(self) -> float:
-        """Mass against our own robot's, to three decimals."""
+        """Mass relative to our own robot's, to three decimals."""
         return round(self.total_mass / OUR_MASS, 3)
 
     @property
     def size_scale(self) -> float:
-        """Its furthest foot's distance, along or across, against our own's, to three decimals."""
+        """Greatest of half length and half track relative to our own robot's, to three decimals."""
         return round(max(self.half_length, self.half_track) / OUR_LEVER, 3)
 
     def each(self, name: str) -> np.ndarray:
-        """One number of every leg, (legs, ...)."""
+        """Values of a field of `Leg`, (legs, ...)."""
         return np.asarray([getattr(leg, name) for leg in self.legs], float)
 
 
 @dataclasses.dataclass(frozen=True)
 class Robot(Body):
-    """A body with servos and feet (`measure.measure`)."""
+    """Body, servos, friction and the numbers that scale with size (`measure.measure`)."""
 
     hip_torque: Number
     """Limit of the abduction and hip servos, N m."""
@@ -160,9 +161,9 @@ class Robot(Body):
 
 
 def robot_from_dict(values: Any) -> Robot:
-    """Rebuilds a robot from the JSON values of `dataclasses.asdict`.
+    """Builds a robot from the JSON values of `dataclasses.asdict`.
 
     Raises:
-      InputError: if a field is missing, unknown or of another type.
+      InputError: if a field is missing, unknown or of the wrong type.
     """
     return parse(Robot, values)

@@ -1,4 +1,4 @@
-"""The TOML file that describes a robot to `mjx_balance`, read and checked."""
+"""Fields and parser of a robot's TOML file."""
 
 import dataclasses
 import tomllib
@@ -19,12 +19,12 @@ Place = tuple[Number, Number, Number]
 
 
 class RobotError(ConfigError):
-    """A robot that cannot be found, read or built; the message says what is wrong with it."""
+    """A robot that cannot be found, read or built; the message says why."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Foot:
-    """Where a foot is, if no geom, site or body is there."""
+    """The place of a foot without a geom, site or body."""
 
     __pydantic_config__ = STRICT
 
@@ -35,7 +35,7 @@ class Foot:
 
 @dataclasses.dataclass(frozen=True)
 class LegFile:
-    """A leg, as a file describes it."""
+    """A leg's table in the file."""
 
     __pydantic_config__ = STRICT
 
@@ -43,45 +43,46 @@ class LegFile:
     joints: tuple[Name, Name, Name]
     """Abduction, hip and knee."""
     foot: Name | Foot
-    """Geom, site or body by its name, or a place on a body."""
+    """Name of a geom, site or body, or a place on a body."""
     side: Literal["left", "right"] | None = None
-    """None: as it is placed."""
+    """None: from its place."""
     end: Literal["front", "hind"] | None = None
-    """None: as it is placed."""
+    """None: from its place."""
     knee: Literal["forward", "backward"] | None = None
-    """Where it points; none: as its limits suggest."""
+    """Direction in which the knee points; none: from its limits."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RobotFile:
-    """What a file says; what it leaves out is read off the model, or follows from the size."""
+    """The content of a robot file; defaults come from the model, or scale with mass and size."""
 
     __pydantic_config__ = STRICT
 
     name: str
+    """Stem of the file name."""
     folder: Path
-    """Of the file."""
+    """Folder of the file."""
     model: Name
     """MJCF or URDF file, relative to `folder`; or `PACKAGE:PATH` of a file inside an installed
     Python package; or `menagerie:NAME`."""
     trunk: Name
-    """Body."""
+    """Name of the body to keep level."""
     legs: Annotated[tuple[LegFile, ...], Len(4, 4)]
     """In the order of the observation."""
     imu: Name | Place | None = None
-    """Site on the trunk, or a place in its frame, m; none: its origin."""
+    """Site on the trunk, or a place in its frame, m; none: the trunk's origin."""
     strip: tuple[Name, ...] = ()
-    """Bodies to leave out, with all that hangs on them, and joints to fix."""
+    """Bodies to remove, with their descendants, and joints to fix."""
     foot_radius: Positive | None = None
-    """m; none: of the model's spheres."""
+    """m; none: from the sphere geoms of the feet."""
     foot_friction: Positive = 0.8
     """Sliding friction of a foot on the board."""
     hip_torque: Positive | None = None
-    """Limit of the abduction and hip servos, N m; none: of the model's actuators."""
+    """Torque limit of the abduction and hip servos, N m; none: from the model's actuators."""
     knee_torque: Positive | None = None
-    """Limit of the knee servos, N m; none: of the model's actuators."""
+    """Torque limit of the knee servos, N m; none: from the model's actuators."""
     servo_stiffness: Positive | None = None
-    """N m / rad; this and the next four: by the robot's mass and size if none."""
+    """N m / rad; none, also of the next five: from the robot's mass and size."""
     servo_damping: Positive | None = None
     """N m s / rad."""
     servo_armature: Positive | None = None
@@ -91,11 +92,11 @@ class RobotFile:
     action_max: Positive | None = None
     """Greatest height change of one decision on one axis, m."""
     board_size: Positive | None = None
-    """Length of the board that it is trained on, m; none: by the robot's size."""
+    """Length of the board in training, m."""
     source: str = ""
-    """Of the model."""
+    """Source of the model."""
     license: str = ""
-    """Of the model."""
+    """License of the model."""
 
 
 REMEDIES = {
@@ -113,7 +114,7 @@ def read_robot_file(path: Path) -> RobotFile:
     """Reads a robot's TOML file.
 
     Raises:
-      RobotError: if it is missing, or something in it is not what it must be.
+      RobotError: if it is missing, unreadable or invalid.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -127,14 +128,14 @@ def read_robot_file(path: Path) -> RobotFile:
 
 
 def parse_robot_file(text: str, path: Path) -> RobotFile:
-    """Reads a robot file's content.
+    """Parses the content of a robot file.
 
     Args:
       text: TOML.
-      path: gives the robot's name and its folder; need not exist.
+      path: gives the robot's name and folder; need not exist.
 
     Raises:
-      RobotError: if something in it is not what it must be.
+      RobotError: names the first invalid field, its value and what would be right.
     """
     try:
         values = tomllib.loads(text)
@@ -152,7 +153,7 @@ def parse_robot_file(text: str, path: Path) -> RobotFile:
 
 
 def _with(table: Any, **own: str) -> Any:
-    """A table with what the file says of it elsewhere; what is no table is refused later."""
+    """A table with fields that its key or the file's path gives; no table: unchanged."""
     if not isinstance(table, dict):
         return table
     for key in own:
@@ -162,7 +163,7 @@ def _with(table: Any, **own: str) -> Any:
 
 
 def _check_joints(file: RobotFile) -> None:
-    """Refuses a joint that two legs, or one leg twice, name."""
+    """Checks that no joint is named twice."""
     owners: dict[str, str] = {}
     for leg in file.legs:
         for joint in leg.joints:
