@@ -17,12 +17,12 @@ from mjx_balance.sim.engines.table import unused_modules
 
 @dataclasses.dataclass(frozen=True)
 class TrainArgs:
-    """Train a policy in MJX, export it and evaluate it in plain MuJoCo."""
+    """Train a policy, export it, and evaluate it in plain MuJoCo."""
 
     run_dir: Path | None = None
     """Folder to create for the run; none: runs/PRESET-SEED-TIME."""
     resume: Path | None = None
-    """Run folder to continue instead."""
+    """Run folder to continue, instead of a new one; its config sets all defaults."""
     profile: bool = False
     """Trace a call of the training program and print the share of time that each part takes."""
     distributed: bool = False

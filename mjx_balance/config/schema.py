@@ -209,10 +209,7 @@ class DQNConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The config of a run; the defaults are the paper's values.
-
-    `preset` returns others by name, `robots.limits.for_robot` adapts one to another robot.
-    """
+    """All settings of a run; in Python, a bare `Config()` has the paper's values."""
 
     __pydantic_config__ = STRICT
 

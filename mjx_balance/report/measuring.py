@@ -20,7 +20,7 @@ from mjx_balance.files.run_folder import read_json
 from mjx_balance.files.validation import parse
 from mjx_balance.policy.file import Policy
 from mjx_balance.report.digest import code_digest
-from mjx_balance.report.reading import FOREIGN, Finite, ReportError, suite_result
+from mjx_balance.report.reading import FOREIGN, Finite, ReportError, suite_results
 from mjx_balance.sim.scene import Scene
 
 DURATION = 60.0
@@ -39,7 +39,7 @@ class Measurements:
     """Results of a policy and of the baselines on the same scenarios."""
 
     results: dict[str, dict[str, dict[str, Any]]]
-    """Controller -> suite -> `reading.suite_result`."""
+    """Controller -> suite -> fields of `reading.SuiteResult`."""
     shares: dict[str, dict[str, list[float]]]
     """Controller -> suite -> (BINS,) share of the physics steps per bin of tilt (`edges`)."""
     envelope: Envelope
@@ -87,24 +87,15 @@ def parse_measurements(saved: dict[str, Any]) -> Measurements:
     """
     shares = parse(_Shares, saved["shares"], ReportError)
     fall_map = parse(Envelope, saved["envelope"], ReportError)
-    numbers = (
-        *fall_map.inclines,
-        *fall_map.rates,
-        fall_map.authority,
-        fall_map.reach,
-        fall_map.duration_s,
-    )
-    for grid in (fall_map.fall_rate, fall_map.mean_tilt):
-        if np.shape(grid) != (len(fall_map.inclines), len(fall_map.rates)):
+    for cells in (fall_map.fall_rate, fall_map.mean_tilt):
+        if np.shape(cells) != (len(fall_map.inclines), len(fall_map.rates)):
             raise ReportError("a grid has another shape than its inclines and rates")
-    if not np.isfinite(
-        [*numbers, *np.ravel(fall_map.fall_rate), *np.ravel(fall_map.mean_tilt)]
-    ).all():
+    if not all(np.isfinite(values).all() for values in dataclasses.astuple(fall_map)):
         raise ReportError("the envelope holds values that are not finite")
     names = ("policy", *CONTROLLERS)
     return Measurements(
         results={
-            name: {suite: suite_result(saved["results"][name][suite], suite) for suite in HEADLINE}
+            name: suite_results({suite: saved["results"][name][suite] for suite in HEADLINE})
             for name in names
         },
         shares={name: {suite: shares[name][suite] for suite in HEADLINE} for name in names},
@@ -118,17 +109,17 @@ def _measure(
     results: dict[str, dict[str, Any]] = {}
     shares: dict[str, dict[str, list[float]]] = {}
     for name in ("policy", *CONTROLLERS):
-        results[name], shares[name] = {}, {}
+        summaries, shares[name] = {}, {}
         for suite in HEADLINE:
             controller = _controller(name, policy, scene)
             with progress(f"{name}, suite {suite}") as bar:
                 rollout = run_suite(
                     scene, controller, suite, scenarios, DURATION, SEEDS.report, bar
                 )
-            summary = summarize(rollout, suite, DURATION, SEEDS.report)
-            results[name][suite] = suite_result(summary, suite)
+            summaries[suite] = summarize(rollout, suite, DURATION, SEEDS.report)
             counts, _ = np.histogram(rollout.tilt, edges(policy.config.task.fail_tilt))
             shares[name][suite] = (counts / counts.sum()).tolist()
+        results[name] = suite_results(summaries)
     with progress("envelope") as bar:
         fall_map = envelope(
             scene, observing(policy), ENVELOPE_SCENARIOS, ENVELOPE_DURATION, SEEDS.report, bar
@@ -152,8 +143,9 @@ def record_rollout(
       PolicyError: if the policy belongs to another scene.
     """
     scene = policy_scene(policy)
-    chosen = _controller(controller, policy, scene)
-    return run_suite(scene, chosen, suite, 1, duration, seed, record=True)
+    return run_suite(
+        scene, _controller(controller, policy, scene), suite, 1, duration, seed, record=True
+    )
 
 
 def _controller(name: str, policy: Policy, scene: Scene) -> Controller:

@@ -48,7 +48,7 @@ class Run:
     metrics: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     policy: Policy | None = None
     results: list[dict[str, dict[str, Any]]] = dataclasses.field(default_factory=list)
-    """For each training seed its evaluation after training, suite -> `suite_result`."""
+    """For each training seed its evaluation after training; see `suite_results`."""
 
 
 def read_run(path: Path) -> Run:
@@ -146,25 +146,19 @@ class _Line:
 
 
 def suite_results(value: Any) -> dict[str, dict[str, Any]]:
-    """Checks an evaluation, suite -> JSON of `rollout.summarize`; see `suite_result`."""
-    results = parse(dict[str, SuiteResult], value, ReportError, name="it")
-    return {suite: _as_dict(result) for suite, result in results.items()}
-
-
-def suite_result(value: Any, suite: str) -> dict[str, Any]:
-    """Checks a suite's result.
+    """Checks an evaluation.
 
     Args:
-      value: JSON of `rollout.summarize`.
-      suite: name of the suite.
+      value: suite -> JSON of `rollout.summarize`.
 
     Returns:
-      The fields of `SuiteResult`.
+      Suite -> the fields of `SuiteResult`.
 
     Raises:
       ReportError: for a value that no evaluation returns.
     """
-    return suite_results({suite: value})[suite]
+    results = parse(dict[str, SuiteResult], value, ReportError, name="it")
+    return {suite: _as_dict(result) for suite, result in results.items()}
 
 
 def _as_dict(result: SuiteResult) -> dict[str, Any]:

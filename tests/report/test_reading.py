@@ -248,7 +248,7 @@ def test_only_what_the_report_shows_is_kept(
 
 def test_an_evaluation_in_which_all_fell_is_one(evaluation_result: Any) -> None:
     result = evaluation_result("paper", 6.0) | {"falls": 8}
-    assert reading.suite_result(result, "paper")["falls"] == 8
+    assert reading.suite_results({"paper": result})["paper"]["falls"] == 8
 
 
 def test_metrics_without_a_line_are_said(tmp_path: Path) -> None:
@@ -336,8 +336,7 @@ def test_a_damaged_folder_is_read_as_far_as_it_goes(
     for line in run.metrics:
         assert all(isinstance(line[name], (int, float)) for name in line if name != "seeds")
     for results in run.results:
-        for suite, result in results.items():
-            assert result == reading.suite_result(result, suite)
+        assert results == reading.suite_results(results)
     page.seeds_table(run, [run, run])
     shutil.rmtree(folder)
 
