@@ -16,7 +16,7 @@ class ReportArgs:
     """Write one HTML page about runs: tables, curves, envelope, video. Needs no JAX."""
 
     run_dirs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Run folders; the first with a policy is shown beside the baselines."""
+    """Run folders; the report compares the first with a policy to the baselines."""
     out: Path | None = None
     """File to write; none: report.html in the first folder."""
     scenarios: int = 64

@@ -266,8 +266,8 @@ def training_pictures(runs: Sequence[Run], config: Config | None) -> list[Pictur
     if curves:
         caption = (
             "Training. The line is the median over runs and seeds, the band their extremes; tilt, "
-            "falls and reward are those of the exploring policy. Points, where there are any: the "
-            "greedy policy of a seed on held-out boards in plain MuJoCo."
+            "falls and reward are those of the exploring policy. Points are validations: the "
+            "greedy policy of a seed in held-out scenarios in plain MuJoCo."
         )
         pictures.append(_picture("Learning curves", figures.learning_curves(curves), caption))
     if config is not None:
