@@ -19,7 +19,7 @@ STEP = 1.0
 PUSH_SPEED = 0.4
 """Speed that a push gives our own robot, m/s; scaled by `size_scale` for others."""
 RIGHT, LEFT, DOWN, UP, PUSH_KEY, LEVEL = 262, 263, 264, 265, 257, 268
-"""GLFW's codes of the arrow keys, Enter and Home."""
+"""GLFW codes of the arrow keys, Enter and Home."""
 HELP = "arrows: tilt the board\nHome: level\nEnter: push"
 
 
@@ -29,7 +29,7 @@ class Session:
     def __init__(
         self, scene: Scene, controller: Controller, suite: str | None = None, seed: int = 0
     ):
-        """Puts the robot on the level board.
+        """Stands the robot on the level board.
 
         Args:
           scene: model, stance and task.
@@ -39,7 +39,7 @@ class Session:
             adds 1.
 
         Raises:
-          SuiteError: if there is no such suite, or the seed is negative.
+          SuiteError: if the suite does not exist, or the seed is negative.
         """
         check_seed(seed)
         self.scene, self.task, self.controller = scene, scene.config.task, controller
@@ -65,7 +65,11 @@ class Session:
         self.push, self.number, self.tilt = np.zeros(2), 0, 0.0
 
     def press(self, key: int) -> None:
-        """Takes a key, by GLFW's code: the camera looks along the robot from behind its right."""
+        """Handles a key press.
+
+        Args:
+          key: GLFW code. The camera looks along the robot from behind its right.
+        """
         moves = {RIGHT: (1, 0), LEFT: (-1, 0), UP: (0, -1), DOWN: (0, 1)}
         if key in moves:
             target = self.target + STEP * np.asarray(moves[key])
@@ -105,7 +109,7 @@ class Session:
         return env.path[0]
 
     def _keyed(self, way: np.ndarray, number: int) -> tilt.Scenario:
-        """A board that turns from `way[0]` to `way[1]` (2, 2), deg, from decision `number` on."""
+        """A board that turns from `way[0]` to `way[1]`, (2, 2) deg, from decision `number` on."""
         phase = self.task.target_period - number * self.task.ctrl_dt
         return tilt.Scenario(way[None], np.asarray([phase]), np.asarray([self.task.board_rate]))
 

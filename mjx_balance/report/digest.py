@@ -1,4 +1,4 @@
-"""Digest of the code that decides a result, so that a kept one is known to be out of date."""
+"""Digest of the code that decides a result: a saved result of other code is out of date."""
 
 import hashlib
 from pathlib import Path

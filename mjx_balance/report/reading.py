@@ -114,7 +114,7 @@ class Tilt:
 
 @dataclasses.dataclass(frozen=True)
 class SuiteResult:
-    """The fields of `rollout.summarize` that a report uses."""
+    """The fields of `summary.summarize` that a report uses."""
 
     __pydantic_config__ = LENIENT
 
@@ -149,7 +149,7 @@ def suite_results(value: Any) -> dict[str, dict[str, Any]]:
     """Checks an evaluation.
 
     Args:
-      value: suite -> JSON of `rollout.summarize`.
+      value: suite -> JSON of `summary.summarize`.
 
     Returns:
       Suite -> the fields of `SuiteResult`.

@@ -19,7 +19,7 @@ def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
     """One row per suite.
 
     Args:
-      results: suite -> JSON of `rollout.summarize`.
+      results: suite -> JSON of `summary.summarize`.
     """
     table = _suites_table("plain MuJoCo, tilt in deg over every physics step")
     for name in ("scenarios", "falls", *STATISTICS, "act mm"):
@@ -87,7 +87,7 @@ def print_summary(
     Args:
       console: to print to.
       run_dir: folder of the run.
-      results: suite -> JSON of `rollout.summarize`.
+      results: suite -> JSON of `summary.summarize`.
       seconds: time that the run took.
     """
     folder = RunFolder(run_dir)
