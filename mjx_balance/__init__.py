@@ -1,7 +1,7 @@
 """Massively parallel DQN training of a quadruped that balances on a tilting board.
 
-`BalanceEnv` needs JAX and is imported on first use, so that `load_policy` works
-where JAX is not installed. Where Gymnasium is, `mjx_balance/Balance-v0` is registered.
+`load_policy` works without JAX, because `BalanceEnv` is imported on first use. With Gymnasium
+installed, this import registers `mjx_balance/Balance-v0`.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""`python -m mjx_balance` is `mjx-balance`."""
+"""Runs the command line: `python -m mjx_balance` equals `mjx-balance`."""
 
 import sys
 

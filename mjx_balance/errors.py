@@ -1,4 +1,4 @@
-"""What a command ends with, besides 0, and the kind of error that is its user's to mend."""
+"""Exit codes of the commands, and the base class of errors in the user's input."""
 
 FAILED = 1
 USAGE_ERROR = 2
@@ -6,7 +6,7 @@ INTERRUPTED = 130
 
 
 def how_to_install(extra: str) -> str:
-    """Where an extra of ours comes from: the package is on no index."""
+    """Returns the sentence that tells how to install an extra; the package is on no index."""
     return (
         f"the extra {extra} brings it: `pip install -e '.[{extra}]'` in a checkout, or "
         f"`pip install 'WHEEL[{extra}]'`"
@@ -14,4 +14,4 @@ def how_to_install(extra: str) -> str:
 
 
 class InputError(ValueError):
-    """Something given that cannot be used; the message, one sentence, says what and why."""
+    """Invalid input; the message is one sentence with the value, the reason and a remedy."""

@@ -1,4 +1,4 @@
-"""Keeps the libraries' imports quiet and short: what they print, what they import beside."""
+"""Silences the imports of JAX and MJX, and skips optional packages that they import."""
 
 import contextlib
 import io
@@ -9,14 +9,14 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def quiet_imports(*unused: str) -> Iterator[None]:
-    """Hides MJX's note that its Warp backend is absent, and what XLA says of cached programs.
+    """Hides MJX's note on its missing Warp backend, and XLA's log messages on cached programs.
 
-    XLA reads its log level when it is first imported, so import JAX in here.
+    Import JAX inside this context: XLA reads its log level at import.
 
     Args:
-      unused: packages that the imported libraries would do without, and that take longer than all
-        the rest: PyTorch (tensorboardX looks for it), Warp (MJX). They seem not to be installed,
-        unless they are imported already.
+      unused: optional packages to hide from the imported libraries, because they are slow to
+        import: PyTorch (for tensorboardX), Warp (for MJX). Packages that are already imported stay
+        visible.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     hidden = [name for name in unused if name not in sys.modules]

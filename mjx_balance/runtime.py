@@ -1,21 +1,21 @@
-"""Runs a policy on a robot: IMU and joint angles in, joint position targets out. NumPy only.
+"""Runs a policy on a robot: from IMU and joint angles to joint position targets. NumPy only.
 
-This file needs nothing else of the package: copy it to the robot, beside a policy file::
+This file needs no other file of the package. Copy it to the robot, beside a policy file::
 
     controller = Controller("policy.safetensors")  # joints: controller.joints
-    ...  # bring the legs to controller.targets, where the robot stands
+    ...  # first move the legs to controller.targets, where the robot stands
     while True:  # once per IMU sample, 250 Hz
         targets = controller.step(joint_positions, gyro, accelerometer)
 
-The targets are pure kinematics. A servo that sags under the robot's weight needs its trim added
-to them, as the simulation adds `scene.stance.leg_trim`; a servo with an integral term does not.
+The targets are pure kinematics. If the servos sag under the robot's weight, add their trim to the
+targets, as the simulation adds `scene.stance.leg_trim`; servos with an integral term need none.
 
-The controller holds when a reading cannot be true, or when the robot does not balance any more:
-the targets stay what they are until `reset`. Before `reset` the robot must be back at its standing
-height. The servos need a watchdog of their own for a loop that stops altogether.
+The controller holds when a reading is impossible, or when the robot no longer balances: the targets
+then stay the same until `reset`. The robot must be back at its standing height before `reset`. The
+servos need a watchdog in case the loop stops.
 
-The policy file's manifest describes the network's inputs row by row (`inputs`); this file follows
-the rows and knows no config.
+The manifest of the policy file describes the network's inputs row by row (`inputs`), so that this
+file needs no config.
 
 Python 3.8 or newer.
 """
@@ -36,48 +36,48 @@ import numpy as np
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts it"
 ACTION = "grid"
-"""How a policy acts: it chooses a row of `actions.table_m`."""
+"""The only kind of action: a row of `actions.table_m`."""
 IMU = 6
 """Gyro x, y and z, accelerometer x, y and z."""
 MOST_BYTES = 64 * 2**20
-"""Larger files are no policies, whatever they say."""
+"""Greatest size of a policy file, bytes."""
 MOST_WHOLE = 100_000
-"""Of any number of a manifest: far more than any policy has."""
+"""Bound of a manifest's numbers."""
 MOMENTARY = ("height",)
-"""Sensors that are read at a decision alone, so that they have one sample."""
+"""Sensors with one sample per decision and no history."""
 MOST_READ = 1_000_000
-"""Samples that the inputs may be means of, all together."""
+"""Greatest number of samples that all inputs together average."""
 GYRO_MOST = 35.0
-"""rad/s of one sample; a gyro's widest usual range is 2,000 deg/s."""
+"""Greatest gyro reading, rad/s; the widest usual range is 2,000 deg/s."""
 ACCEL_MOST = 160.0
-"""m/s^2 of one sample; an accelerometer's usual range is 16 g."""
+"""Greatest accelerometer reading, m/s^2; a usual range is 16 g."""
 WEIGHT = (0.5 * 9.81, 1.5 * 9.81)
-"""m/s^2, least and most mean of a decision's samples; pushes give 9.2 to 11."""
+"""Least and greatest norm of a decision's mean acceleration, m/s^2; pushes give 9.2 to 11."""
 LEAN_MOST = 40.0
-"""deg by which that mean may lean. 6 deg are a fall, but a push looks like a lean of up to 29."""
+"""Greatest angle of that mean from z, deg. A fall has 6 deg, but a push can look like 29."""
 AWAY_MOST = 0.5
-"""rad by which a joint may be off its target at a decision; pushes give 0.03."""
+"""Greatest error of a joint at a decision, rad; pushes give 0.03."""
 KNEE_SLACK = 0.1
-"""rad by which a knee may read beyond its stops."""
+"""Tolerance of a knee's reading beyond its stops, rad."""
 LATE_SAMPLES = 5
-"""Sample periods between two calls, and by which a decision may last too long or too short."""
+"""Longest time between two calls, and greatest error of a decision's length, sample periods."""
 
 
 class PolicyFileError(ValueError):
-    """A policy file that cannot be run; the message says what is wrong with it."""
+    """Unusable policy file; the message says why."""
 
 
 class State(str, enum.Enum):
-    """What a controller is doing."""
+    """State of a controller."""
 
     __str__ = str.__str__
 
     STANDING = "standing"
-    """At its standing height, before the first sample."""
+    """Before the first sample; the targets are those of the standing robot."""
     BALANCING = "balancing"
-    """Deciding, sample after sample."""
+    """The policy controls the robot."""
     HOLDING = "holding"
-    """The targets stay what they are, until `reset`."""
+    """The targets stay the same until `reset`."""
 
 
 class _Unsafe(Exception):
@@ -85,9 +85,9 @@ class _Unsafe(Exception):
 
 
 class Controller:
-    """Runs a policy, from one sample of the sensors to the next.
+    """Runs a policy, sample by sample.
 
-    The first sample stands for all before it: the robot has been standing still. The controller
+    The first sample fills the history: the robot must have been standing still. The controller
     decides at the first sample and then every `decision_samples` samples; in between the legs
     follow their ramp. Observations and targets equal those of training.
     """
@@ -95,14 +95,14 @@ class Controller:
     def __init__(
         self, path: str | os.PathLike[str], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Reads a policy file; the controller is then standing.
+        """Reads a policy file; the state is then STANDING.
 
         Args:
           path: of the policy file.
-          clock: returns the time of a call, s; in a simulation, the simulation's.
+          clock: returns the current time, s; in simulation, pass the simulation's.
 
         Raises:
-          PolicyFileError: if the file is missing, damaged, or no policy this file can run.
+          PolicyFileError: if the file is missing, damaged, or not a policy that this file can run.
         """
         path = Path(path)
         try:
@@ -122,7 +122,7 @@ class Controller:
         self.reset()
 
     def _set_up(self, manifest: dict[str, Any]) -> None:
-        """Reads the manifest, and makes room for the histories."""
+        """Reads the manifest, and allocates the histories."""
         self._legs = legs = _Legs(manifest["robot"])
         self.joints: list[list[str]] = [list(leg["joints"]) for leg in manifest["robot"]["legs"]]
         """Names of the abduction, hip and knee joints of every leg, in the order of `step`."""
@@ -132,11 +132,11 @@ class Controller:
         self.sample_dt = _number("sample_s", timing["sample_s"], 1e-4, 1)
         """Time between two IMU samples, s."""
         self.decision_samples = _whole("decision_samples", timing["decision_samples"], 1)
-        """IMU samples from one decision to the next."""
+        """IMU samples per decision."""
         self._decision_dt = self.decision_samples * self.sample_dt
-        # From one fall to the other within a decision.
+        # The rate from a fall on one side to a fall on the other within a decision.
         fall = math.radians(_number("fail_tilt_deg", manifest["fail_tilt_deg"], 0, 90))
-        self._turn_most = 2 * fall / self._decision_dt
+        self._rate_most = 2 * fall / self._decision_dt
         ramp = _whole("ramp_samples", timing["ramp_samples"], 1, self.decision_samples)
         self._share = (np.arange(1, ramp + 1) / ramp)[:, None]
         self._height = _number("body_height_m", manifest["body_height_m"], *legs.height_range)
@@ -148,7 +148,7 @@ class Controller:
 
         self._inputs = inputs = _Inputs(manifest["inputs"], len(self.joints))
         self._history = inputs.lookback("gyro", "accelerometer")
-        # The history as of the last decision, then room for the samples since.
+        # The history up to the last decision, then the samples since.
         self._imu = np.empty((self._history + self.decision_samples, IMU))
         self._commands = np.empty((inputs.lookback("command"), len(self.joints)))
 
@@ -159,16 +159,16 @@ class Controller:
 
     @property
     def targets(self) -> np.ndarray:
-        """(legs, 3) rad that `step` returned last; before that, the standing robot's."""
+        """(legs, 3) joint targets, rad, as `step` returned last; at first the standing pose."""
         return self._targets.copy()
 
     def reset(self) -> None:
-        """Begins anew, with a robot that has been standing still at its standing height."""
+        """Starts again; the robot must stand still at its standing height."""
         self.state = State.STANDING
         self.reason = ""
-        """Why the controller is holding, in a sentence."""
+        """The reason for holding, in a sentence."""
         self.action: int | None = None
-        """Index of the latest action."""
+        """Index of the last action."""
         self._commands[:] = self._height
         self._path = self._legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]
@@ -176,19 +176,19 @@ class Controller:
         self._called = self._decided = math.nan
 
     def hold(self, reason: str) -> None:
-        """Keeps the targets as they are, until `reset`."""
+        """Holds the targets until `reset`; does nothing if the controller already holds."""
         if self.state is not State.HOLDING:
             self.state, self.reason = State.HOLDING, reason
 
     def step(
         self, joint_positions: np.ndarray, gyro: np.ndarray, accelerometer: np.ndarray
     ) -> np.ndarray:
-        """Takes a sample of the sensors; returns the joint targets until the next sample.
+        """Processes a sample of the sensors; returns the joint targets until the next sample.
 
-        It holds if a reading is outside a sensor's range, if the IMU repeats itself, if a call
-        comes too late, or if samples come at another rate than in training. At a decision it also
-        holds if lean, angular rate or weight are not those of a balancing robot, or if a joint is
-        far from its target.
+        It holds if a reading is outside a sensor's range, if the IMU repeats one sample, if a call
+        comes too late, or if the sample rate is not that of training. At a decision it also holds
+        if lean, angular rate or weight are not those of a balancing robot, or if a joint is far
+        from its target.
 
         Args:
           joint_positions: (legs, 3) abduction, hip and knee angles, rad, in the order of `joints`.
@@ -201,7 +201,7 @@ class Controller:
         Raises:
           ValueError: if an argument has another shape.
         """
-        self._take(joint_positions, gyro, accelerometer)
+        self._read_sensors(joint_positions, gyro, accelerometer)
         if self.state is not State.HOLDING:
             try:
                 self._advance(self._clock())
@@ -209,8 +209,8 @@ class Controller:
                 self.hold(str(unsafe))
         return self._targets.copy()
 
-    def _take(self, *arguments: np.ndarray) -> None:
-        """Writes all readings in a row: joints, gyro, accelerometer."""
+    def _read_sensors(self, *arguments: np.ndarray) -> None:
+        """Checks shapes, and copies all readings to `_reading`: joints, gyro, accelerometer."""
         joints, gyro, accel = (np.asarray(values, float) for values in arguments)
         if joints.shape != self._targets.shape or gyro.shape != (3,) or accel.shape != (3,):
             raise ValueError(
@@ -222,7 +222,7 @@ class Controller:
         self._reading[-3:] = accel
 
     def _advance(self, now: float) -> None:
-        """Uses the latest sample: checks, decides if a decision is due, moves the targets on."""
+        """Checks the sample, decides if a decision is due, and updates the targets."""
         self._check_reading()
         if self.state is State.STANDING:
             self._imu[:] = self._reading[-IMU:]
@@ -261,7 +261,7 @@ class Controller:
             )
 
     def _check_decision(self, now: float) -> None:
-        """Compares the samples since the last decision with the rate and with each other."""
+        """Checks the sample rate since the last decision, and that the IMU's samples differ."""
         took, most = now - self._decided, LATE_SAMPLES * self.sample_dt
         if abs(took - self._decision_dt) > most:
             raise _Unsafe(
@@ -272,35 +272,33 @@ class Controller:
             raise _Unsafe(f"the IMU gave the same sample {self.decision_samples + 1} times")
 
     def _check_posture(self) -> None:
-        """Compares samples since the last decision, and joints, with a balancing robot's."""
-        turn, pull = np.split(self._imu[self._history :].mean(axis=0), 2)
-        weight, turns = float(np.linalg.norm(pull)), float(np.linalg.norm(turn[:2]))
+        """Checks the mean of a decision's IMU samples, and the joints, for a balancing robot."""
+        gyro, accel = np.split(self._imu[self._history :].mean(axis=0), 2)
+        weight, rate = float(np.linalg.norm(accel)), float(np.linalg.norm(gyro[:2]))
         if not WEIGHT[0] <= weight <= WEIGHT[1]:
             raise _Unsafe(
                 f"the accelerometer gives {weight:.3g} m/s^2 in the mean of a decision; it must be "
                 f"{WEIGHT[0]:.3g} to {WEIGHT[1]:.3g}, and 9.81 at rest"
             )
-        lean = math.degrees(math.acos(min(max(pull[2] / weight, -1.0), 1.0)))
+        lean = math.degrees(math.acos(min(max(accel[2] / weight, -1.0), 1.0)))
         if lean > LEAN_MOST:
             raise _Unsafe(
                 f"the accelerometer leans by {lean:.3g} deg in the mean of a decision, more than "
                 f"{LEAN_MOST:g}: the robot has fallen, or up is not its z"
             )
-        if turns > self._turn_most:
+        if rate > self._rate_most:
             raise _Unsafe(
-                f"the gyro gives {turns:.3g} rad/s about x and y in the mean of a decision, more "
-                f"than {self._turn_most:.3g}: the robot falls, or these are no rad/s"
+                f"the gyro gives {rate:.3g} rad/s about x and y in the mean of a decision, more "
+                f"than {self._rate_most:.3g}: the robot falls, or these are no rad/s"
             )
-        away = np.abs(self._reading[:-IMU] - self._targets.ravel())
-        k = int(away.argmax())
-        if away[k] > AWAY_MOST:
+        errors = np.abs(self._reading[:-IMU] - self._targets.ravel())
+        k = int(errors.argmax())
+        if errors[k] > AWAY_MOST:
             name = [name for leg in self.joints for name in leg][k]
-            raise _Unsafe(
-                f"{name} is {away[k]:.3g} rad from where it was told to be, more than {AWAY_MOST:g}"
-            )
+            raise _Unsafe(f"{name} is {errors[k]:.3g} rad from its target, more than {AWAY_MOST:g}")
 
     def _decide(self, now: float) -> None:
-        """Chooses an action and lays its ramp out in `_path`."""
+        """Chooses an action, and computes its ramp of targets, `_path`."""
         self.action = self._network.greedy(self._observation())
         before = self._commands[-1].copy()
         after = self._legs.moved(before, self._table[self.action])
@@ -311,7 +309,6 @@ class Controller:
         self._since, self._decided = 0, now
 
     def _observation(self) -> np.ndarray:
-        """(obs_size,) the network's input."""
         gyro, accelerometer = np.split(self._imu, 2, axis=1)
         return self._inputs.observe(
             {
@@ -324,19 +321,13 @@ class Controller:
 
 
 class _Inputs:
-    """The network's inputs, as the rows of the manifest's `inputs` describe them.
+    """The network's inputs, from the rows of the manifest's `inputs`.
 
-    An input is (mean of `window` samples - offset) / scale; the newest of these samples is `lag`
-    samples old.
+    An input is (mean of `window` samples - offset) / scale; its newest sample is `lag` samples old.
     """
 
     def __init__(self, rows: list[dict[str, Any]], legs: int) -> None:
-        channels = {
-            "height": legs,
-            "command": legs,
-            "gyro": 3,
-            "accelerometer": 3,
-        }
+        channels = {"height": legs, "command": legs, "gyro": 3, "accelerometer": 3}
         self._ages = dict.fromkeys(channels, 1)
         groups: dict[tuple[str, int], list[tuple[int, int, int]]] = {}
         for k, row in enumerate(rows):
@@ -365,11 +356,11 @@ class _Inputs:
             self._groups.append((sensor, places, -1 - np.arange(window)[:, None] - lags, index))
 
     def lookback(self, *sensors: str) -> int:
-        """Samples of these sensors that are needed, the newest included."""
+        """Number of samples of these sensors that the inputs need, the newest included."""
         return max(self._ages[sensor] for sensor in sensors)
 
     def observe(self, samples: dict[str, np.ndarray]) -> np.ndarray:
-        """(size,) from the samples of each sensor, (n, channels), the newest last."""
+        """Inputs (size,) from {sensor: samples (n, channels), the newest last}."""
         values = np.empty(self.size)
         for sensor, places, steps, index in self._groups:
             values[places] = samples[sensor][steps, index].mean(axis=0)
@@ -377,7 +368,7 @@ class _Inputs:
 
 
 class _Legs:
-    """The robot's legs: foot heights to joint angles and back; see the manifest's `robot`."""
+    """Leg kinematics: foot heights to joint angles and back (Leg in robots/robot.py)."""
 
     def __init__(self, robot: dict[str, Any]) -> None:
         def each(name: str, *shape: int) -> np.ndarray:
@@ -391,7 +382,7 @@ class _Legs:
         if not ((self._a > 0) & (self._b > 0)).all() or not (abs(self._signs) == 1).all():
             raise PolicyFileError("its legs have lengths that are not above 0, or signs not +-1")
         self._bends = np.sign(self._knee.sum(axis=-1))
-        # What foot and hip add to the length between them.
+        # Body height = `_rise` + distance from hip to foot, if the hip's axis is level.
         self._rise = radius + self._drop - axis_height
         self._lift = radius - axis_height
         self._sides = np.where((each("left") != 0, each("front") != 0), 1.0, -1.0)
@@ -402,14 +393,14 @@ class _Legs:
         """Least and greatest body height that all legs reach, m."""
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest angles of all joints that a reading can be, rad."""
+        """Least and greatest possible reading of all joints, (3 legs,) each, rad."""
         turns = np.broadcast_to((-math.pi, math.pi), (*self._signs.shape, 2)).copy()
         turns[:, 2] = self._knee + np.asarray((-KNEE_SLACK, KNEE_SLACK))
         ends = self._signs[..., None] * (turns - self._zeros[..., None])
         return ends.min(axis=-1).ravel(), ends.max(axis=-1).ravel()
 
     def moved(self, heights: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Foot heights (legs,) after a change (2,): left legs +a_x, front legs +a_y, m."""
+        """Foot heights (legs,) after an action (2,): left legs +a_x, front legs +a_y, m."""
         moved = heights + change[0] * self._sides[0] + change[1] * self._sides[1]
         return np.clip(moved, *self.height_range)
 
@@ -431,7 +422,7 @@ class _Legs:
 
 
 class _Network:
-    """From an observation to the best action."""
+    """The Q-network; it computes the best action only."""
 
     def __init__(
         self, network: dict[str, Any], inputs: int, weights: dict[str, np.ndarray]
@@ -445,15 +436,12 @@ class _Network:
             columns[-1] = 1 + len(self.factors)
         names = [f"hidden_{k}" for k in range(len(hidden))] + ["head"]
         self._layers = [
-            (
-                _weight(weights, f"{name}/kernel", (n, m)),
-                _weight(weights, f"{name}/bias", (m,)),
-            )
+            (_weight(weights, f"{name}/kernel", (n, m)), _weight(weights, f"{name}/bias", (m,)))
             for name, n, m in zip(names, rows, columns)
         ]
 
     def greedy(self, observation: np.ndarray) -> int:
-        """Index of the best action; raises `_Unsafe` if there is none."""
+        """Index of the best action; raises `_Unsafe` if an output is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             obs = x = observation.astype(np.float32)
             for kernel, bias in self._layers[:-1]:
@@ -468,7 +456,7 @@ class _Network:
         return index
 
     def _nearest(self, out: np.ndarray, axis: int) -> int:
-        """The level nearest to the best point, which a radial head gives after its value."""
+        """The level nearest to the best point of a radial head, whose outputs are V and mu."""
         last = np.float32(self.factors[axis] - 1)
         return int(np.clip(np.rint((out[1 + axis] + 1) * last / 2), 0, last))
 
@@ -479,7 +467,7 @@ class _Network:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Manifest and weights of a safetensors file: size of the header, header, numbers."""
+    """Reads manifest and weights of a safetensors file: size of the header, header, numbers."""
     try:
         if path.exists() and not path.is_file():
             raise PolicyFileError("it cannot be read: it is no regular file")
@@ -515,7 +503,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _array(name: str, entry: dict[str, Any], content: bytes) -> np.ndarray:
-    """A weight of a safetensors file."""
     if entry["dtype"] != "F32":
         raise PolicyFileError(f"weight {name} is {entry['dtype']}; it must be F32 (float32)")
     begin, end = entry["data_offsets"]
@@ -525,7 +512,7 @@ def _array(name: str, entry: dict[str, Any], content: bytes) -> np.ndarray:
 
 
 def _weight(weights: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """A weight as the network needs it."""
+    """Checks shape and values of a weight, and returns it."""
     if name not in weights or weights[name].shape != shape:
         raise PolicyFileError(f"weight {name} is missing or not of shape {shape}")
     if not np.isfinite(weights[name]).all():
@@ -548,7 +535,7 @@ def _whole(name: str, value: Any, least: int, most: int = MOST_WHOLE) -> int:
 
 
 def _numbers(name: str, values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Finite numbers of a shape, in which none is any length."""
+    """Checks and returns bounded numbers; None in `shape` is any length."""
     array = np.asarray(values, float)
     fits = array.ndim == len(shape) and all(n in (m, None) for m, n in zip(array.shape, shape))
     if not fits or not (abs(array) < MOST_WHOLE).all():

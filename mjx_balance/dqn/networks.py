@@ -44,7 +44,7 @@ class QNetwork(nn.Module):
             x = nn.relu(nn.Dense(width, name=f"hidden_{i}")(x))
         factors = tuple(self.factors)
         if not self.radial:
-            return heads.Added(nn.Dense(sum(factors), name="head")(x), factors)
+            return heads.Additive(nn.Dense(sum(factors), name="head")(x), factors)
         out = nn.Dense(1 + len(factors), name="head")(jnp.concatenate((x, obs), axis=-1))
         profile = self.param("profile", nn.initializers.zeros, (4,))
         stretch = self.param("stretch", nn.initializers.zeros, (len(factors),))

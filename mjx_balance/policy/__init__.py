@@ -1,1 +1,1 @@
-"""The exported policy: file, heads, ONNX."""
+"""Exported policies: file, manifest, NumPy network, heads, ONNX."""

@@ -1,7 +1,6 @@
-"""Rewrites policy files of format 4 as format 5; weights stay bit for bit.
+"""Converts policy files of format 4 to format 5; the weights stay the same bits.
 
-Format 4 described the observation by names and scales; a runtime had to derive the layout from
-the config.
+Format 4 has only names and scales of the observation; format 5 has the rows as `inputs`.
 """
 
 from pathlib import Path
@@ -20,15 +19,18 @@ from mjx_balance.policy.network import Policy
 
 
 def convert_policy(path: Path, out: Path) -> Policy:
-    """Writes a policy file of format 4 or 5 as one of format 5, whole or not at all.
+    """Converts a policy file of format 4 or 5 to format 5; writes atomically.
 
     Args:
-      path: of the file to read.
-      out: of the file to write; may be the same.
+      path: file to read.
+      out: file to write; may be the same.
+
+    Returns:
+      The policy.
 
     Raises:
-      PolicyError: if it is no such policy.
-      OSError: if it cannot be written; what was there before is then still there.
+      PolicyError: if `path` is not a policy of these formats.
+      OSError: if `out` cannot be written; an old file then stays.
     """
     manifest, weights = read_policy(path)
     try:
@@ -38,7 +40,7 @@ def convert_policy(path: Path, out: Path) -> Policy:
 
 
 def upgrade(manifest: Any) -> Any:
-    """The manifest in format 5, if it is one of format 4; anything else unchanged."""
+    """Returns a manifest of format 4 in format 5, and anything else unchanged."""
     if not isinstance(manifest, dict):
         return manifest
     if (manifest.get("format"), manifest.get("version")) != (FORMAT, CONVERTIBLE):

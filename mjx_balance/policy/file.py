@@ -1,7 +1,4 @@
-"""Policy files: safetensors with float32 weights, and the manifest as JSON in their metadata.
-
-Nothing here needs JAX.
-"""
+"""Policy files: safetensors with float32 weights, and a JSON manifest in the metadata. No JAX."""
 
 import json
 import os
@@ -20,11 +17,11 @@ from mjx_balance.policy.network import Policy
 
 MOST_BYTES = 64 * 2**20
 MOST_MANIFEST = 4 * 2**20
-"""Larger files and manifests are no policies, whatever they say."""
+"""Greatest size of a manifest, characters; larger files and manifests are refused."""
 
 
 def flat_weights(params: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Names every array of a flax network's variables, e.g. `hidden_0/kernel`."""
+    """Flattens a flax network's variables to {name: float32 array}, e.g. `hidden_0/kernel`."""
     weights = {}
     for layer, value in params["params"].items():
         arrays = value.items() if isinstance(value, Mapping) else [("", value)]
@@ -37,19 +34,19 @@ def flat_weights(params: Mapping[str, Any]) -> dict[str, np.ndarray]:
 def save_policy(
     path: str | os.PathLike[str], params: Mapping[str, Any], manifest: dict[str, Any]
 ) -> Policy:
-    """Writes a policy file, whole or not at all.
+    """Writes a policy file atomically.
 
     Args:
-      path: where to.
+      path: file to write.
       params: the flax network's variables, {"params": {layer: {kernel, bias}, name: array}}.
       manifest: from `make_manifest`.
 
     Returns:
-      The policy as it will be loaded.
+      The policy.
 
     Raises:
-      PolicyError: if weights and manifest make no policy.
-      OSError: if it cannot be written.
+      PolicyError: if weights and manifest do not match.
+      OSError: if the file cannot be written.
     """
     return write_policy(path, flat_weights(params), manifest)
 
@@ -57,7 +54,7 @@ def save_policy(
 def write_policy(
     path: str | os.PathLike[str], weights: Mapping[str, np.ndarray], manifest: dict[str, Any]
 ) -> Policy:
-    """`save_policy` of weights that have the file's names."""
+    """As `save_policy`, for weights from `flat_weights`."""
     policy = Policy(manifest, weights)
     content = safetensors.numpy.save(dict(weights), metadata={"manifest": json.dumps(manifest)})
     write_atomically(Path(path), content)
@@ -65,7 +62,7 @@ def write_policy(
 
 
 def shipped_policies() -> dict[str, Path]:
-    """The policies that come with this package, by name: `best`, and one for each other robot."""
+    """Returns the files of the shipped policies by name: `best`, and one for each other robot."""
     package = Path(__file__).resolve().parents[1]
     installed = package / "policies"
     folder = installed if installed.is_dir() else package.parent / "policies"
@@ -74,10 +71,10 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def find_policy(name: str | os.PathLike[str]) -> Path:
-    """The file of a policy.
+    """Finds a policy file.
 
     Args:
-      name: the file's, a run folder's, or a shipped policy's.
+      name: path of the file or of a run folder, or the name of a shipped policy.
 
     Raises:
       PolicyError: if there is none.
@@ -100,13 +97,16 @@ def find_policy(name: str | os.PathLike[str]) -> Path:
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Reads a policy file.
+    """Loads a policy.
 
     Args:
-      path: of the file, of the run folder that it is in, or a shipped policy's name.
+      path: path of the file or of a run folder, or the name of a shipped policy.
+
+    Returns:
+      A callable: observations (obs_size,) or (batch, obs_size) -> action indices () or (batch,).
 
     Raises:
-      PolicyError: if it is missing, truncated, or not a policy this release can run.
+      PolicyError: if the file is missing, truncated, or not a policy that this release can run.
     """
     path = find_policy(path)
     manifest, weights = read_policy(path)
@@ -117,10 +117,10 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 
 def read_policy(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
-    """Manifest and weights of a policy file of any version.
+    """Reads manifest (JSON) and weights by name of a policy file of any version.
 
     Raises:
-      PolicyError: if it is no safetensors file with a manifest.
+      PolicyError: if the file is not safetensors with float32 weights and a JSON manifest.
     """
     if path.stat().st_size > MOST_BYTES:
         raise PolicyError(
@@ -142,7 +142,7 @@ def _read(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
         if len(text) > MOST_MANIFEST:
             raise PolicyError(f"its manifest has {len(text)} characters, more than {MOST_MANIFEST}")
         for name in file.keys():  # noqa: SIM118
-            # NumPy has no name for some of the types that safetensors knows.
+            # Checked before reading: NumPy lacks some dtypes of safetensors.
             if file.get_slice(name).get_dtype() != "F32":
                 kind = file.get_slice(name).get_dtype()
                 raise PolicyError(f"weight {quote(name)} is {kind}; it must be F32 (float32)")

@@ -1,8 +1,8 @@
-"""The last step of a Q-network: what its outputs say of the actions.
+"""Heads of a Q-network: action values from the outputs of the last layer.
 
-Written once for NumPy (the exported policy) and JAX (training): the array library is that of
-the arguments. An action index is a mixed-radix number with one digit per factor. A head knows
-the value of one action and the best action without valuing all of them.
+They work on NumPy arrays (the exported policy) and JAX arrays (training). An action index is a
+mixed-radix number with one digit per factor. `q_value` and `argmax` do not compute the values of
+all actions.
 """
 
 import dataclasses
@@ -15,13 +15,13 @@ import numpy as np
 
 
 @dataclasses.dataclass(frozen=True)
-class Added:
-    """The value of an action as the sum of the values of its digits."""
+class Additive:
+    """The value of an action is the sum of the values of its digits."""
 
     branches: Any
     """(..., sum(factors)) a value for every digit of every factor."""
     factors: tuple[int, ...]
-    """Numbers of digits."""
+    """Number of levels of each digit."""
 
     def q_values(self) -> Any:
         """Values of all actions, (..., prod(factors))."""
@@ -51,20 +51,20 @@ class Added:
 
 @dataclasses.dataclass(frozen=True)
 class Radial:
-    """The value of an action by its distance from the best point.
+    """The value of an action falls with its distance from the best point mu.
 
     Q(s, a) = V(s) + alpha * exp(-beta * z) - kappa * z
     z = sqrt(delta^2 + |exp(stretch) * (x(a) - mu(s))|^2)
     """
 
     out: Any
-    """(..., 1 + factors) V and mu."""
+    """(..., 1 + len(factors)) V and mu."""
     profile: Any
-    """(4,) alpha, beta, kappa and delta before softplus makes them positive."""
+    """(4,) alpha, beta, kappa and delta, before softplus."""
     stretch: Any
-    """(factors,) logarithm of each axis' scale."""
+    """(len(factors),) logarithm of each axis' scale."""
     factors: tuple[int, ...]
-    """Numbers of points on each axis."""
+    """Number of points on each axis."""
 
     def q_values(self) -> Any:
         """Values of all actions, (..., prod(factors))."""
@@ -81,7 +81,7 @@ class Radial:
         return self.out[..., 0] + alpha * xp.exp(-beta * z) - kappa * z
 
     def argmax(self) -> Any:
-        """Indices (...) of the best actions: on every axis, the point nearest to mu."""
+        """Indices (...) of the best actions: the point nearest to mu on every axis."""
         xp = self.out.__array_namespace__()
         last = np.asarray(self.factors, np.float32) - 1
         nearest = xp.clip(xp.rint((self.out[..., 1:] + 1) * last / 2), 0, last)
@@ -89,29 +89,29 @@ class Radial:
         return _index([digits[..., k] for k in range(len(self.factors))], self.factors)
 
 
-Head = Added | Radial
+Head = Additive | Radial
 
 
 def network_factors(head: str, levels: Sequence[int]) -> tuple[int, ...]:
-    """Factors of a head over a grid of actions: all actions at once, or axis by axis.
+    """Factors of a head over a grid of actions: one for all actions ("joint"), or one per axis.
 
     Args:
       head: "joint", "factored" or "radial".
-      levels: of each axis of the grid.
+      levels: number of levels of each axis.
     """
     return (math.prod(levels),) if head == "joint" else tuple(levels)
 
 
 @functools.cache
 def points(factors: tuple[int, ...]) -> np.ndarray:
-    """Where the radial head places the actions: (prod(factors), len(factors)), -1 to 1."""
+    """The radial head's points x(a) of all actions, (prod(factors), len(factors)), -1 to 1."""
     axes = [np.linspace(-1, 1, levels) for levels in factors]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     return grid.reshape(-1, len(factors)).astype(np.float32)
 
 
 def _index(digits: Sequence[Any], factors: Sequence[int]) -> Any:
-    """The action indices (...) that digits (...) make."""
+    """Action indices (...) from their digits (...)."""
     index = digits[0]
     for digit, levels in zip(digits[1:], factors[1:], strict=True):
         index = index * levels + digit

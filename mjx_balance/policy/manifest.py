@@ -1,8 +1,7 @@
-"""The manifest of a policy: everything that is needed to run it elsewhere, as JSON values.
+"""The manifest of a policy: all that a runtime needs besides the weights, as JSON values.
 
-`inputs` are the rows of the observation, from which a runtime builds the network's input without
-knowing the config. All parts but `scene_hash`, `versions` and `training` follow from `config` and
-`robot`.
+`inputs` are the rows of the observation; a runtime follows them and needs no config. `scene_hash`,
+`versions` and `training` are provenance; all other parts follow from `config` and `robot`.
 """
 
 import importlib.metadata
@@ -20,22 +19,22 @@ from mjx_balance.task.observation import input_rows
 
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 CONVERTIBLE = 4
-"""Older version that `convert.py` reads."""
+"""Older version that `convert.py` converts."""
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts a file of version 4"
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 """Packages whose versions a manifest records."""
 
 
 class PolicyError(InputError):
-    """A policy file that cannot be used; the message says what is wrong with it."""
+    """Unusable policy file; the message says why."""
 
 
 def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) -> dict[str, Any]:
-    """Describes a policy.
+    """Makes the manifest of a policy.
 
     Args:
-      config: what it was trained with.
-      scene_hash: fingerprint of the scene it was trained in.
+      config: of the training.
+      scene_hash: fingerprint of the training's scene.
       training: provenance, e.g. decisions and seconds.
 
     Returns:
@@ -53,7 +52,7 @@ def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) 
 
 
 def describe(config: Config, robot: Robot) -> dict[str, Any]:
-    """The parts of a manifest that follow from config and robot, for a runtime to read."""
+    """Returns the parts of a manifest that follow from config and robot, as JSON values."""
     task = config.task
     return {
         "robot": to_dict(robot),
@@ -83,10 +82,11 @@ def network_factors(config: Config) -> tuple[int, ...]:
 
 
 def read_manifest(manifest: Any) -> tuple[Config, Robot]:
-    """Config and robot of a manifest, all of whose other parts follow from them.
+    """Checks a manifest, and returns its config and robot.
 
     Raises:
-      PolicyError: for another format, a config that cannot be run, or a part that differs.
+      PolicyError: if format or version differ, config or robot are invalid, or another part does
+        not follow from them.
     """
     if not isinstance(manifest, dict):
         raise PolicyError("its manifest is not a JSON object")
@@ -103,10 +103,10 @@ def read_manifest(manifest: Any) -> tuple[Config, Robot]:
 
 
 def config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
-    """Config and robot of a manifest of this format or the one before.
+    """Returns config and robot of a manifest of format 4 or 5.
 
     Raises:
-      PolicyError: if one of them, or another part, is not of its type, or cannot be run.
+      PolicyError: if a part has the wrong type, or config or robot are invalid.
     """
     kinds = {"config": dict, "robot": dict, "scene_hash": str, "versions": dict, "training": dict}
     for name, kind in kinds.items():
@@ -124,7 +124,7 @@ def config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
 
 
 def installed_version(package: str) -> str | None:
-    """Version of an installed package; None for one that is not."""
+    """Returns the version of a package, or None if it is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

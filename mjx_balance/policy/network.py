@@ -13,23 +13,21 @@ from mjx_balance.task.actions import action_table
 
 
 class Policy:
-    """A greedy policy in NumPy.
+    """A greedy policy in NumPy: a callable from observations to action indices.
 
-    Calling it maps observations to action indices. `.manifest` is the file's JSON,
-    `.config` the config it was trained with, `.robot` the robot, `.actions` the
-    (num_actions, 2) height changes in m that the indices stand for, `.layers` the kernels
-    and biases.
+    Attributes: `manifest` (JSON values), `config`, `robot`, `actions` ((num_actions, 2) height
+    changes a_x and a_y, m) and `layers` (pairs of kernel and bias).
     """
 
     def __init__(self, manifest: dict[str, Any], weights: Mapping[str, np.ndarray]):
-        """Checks manifest and weights of a policy file.
+        """Checks manifest and weights.
 
         Args:
-          manifest: from `make_manifest`, or a file's.
-          weights: float32 arrays by the names of `flat_weights`.
+          manifest: from `make_manifest` or a file.
+          weights: {name: float32 array}, as `flat_weights`.
 
         Raises:
-          PolicyError: if manifest and weights do not fit together.
+          PolicyError: if manifest and weights do not match, or one of them is invalid.
         """
         self.config, self.robot = read_manifest(manifest)
         self.manifest = manifest
@@ -56,9 +54,9 @@ class Policy:
 
     @property
     def fingerprint(self) -> str:
-        """Short digest of the weights."""
+        """Digest of the weights, 16 hexadecimal digits."""
         arrays = [array for layer in self.layers for array in layer]
-        if self.radial:  # as they enter the head
+        if self.radial:
             arrays += [np.logaddexp(0, self.profile), np.exp(self.stretch)]
         return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
@@ -91,7 +89,7 @@ class Policy:
             x = np.maximum(x @ kernel + bias, 0.0)
         kernel, bias = self.layers[-1]
         if not self.radial:
-            return heads.Added(x @ kernel + bias, self.factors)
+            return heads.Additive(x @ kernel + bias, self.factors)
         out = np.concatenate((x, obs), axis=-1) @ kernel + bias
         return heads.Radial(out, self.profile, self.stretch, self.factors)
 

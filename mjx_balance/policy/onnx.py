@@ -1,9 +1,7 @@
-"""The exported policy as an ONNX model, to run where there is no Python.
+"""Exports a policy as an ONNX model, for runtimes without Python; needs the extra `onnx`.
 
-The only module that needs the package `onnx` (extra `onnx`). The graph computes what
-`policy.Policy` computes of a batch, operation by operation, so that the two differ in rounding
-alone: the action follows from the network's outputs, as in `dqn/heads.py`, not from a search
-among the values.
+The graph has the operations of `Policy`, so that the two differ only in rounding: the action
+follows from the network's outputs (`heads.py`), not from an argmax over all values.
 """
 
 import json
@@ -22,7 +20,7 @@ from mjx_balance.policy.network import Policy
 
 OPSET = 17
 IR_VERSION = 8
-"""What belongs to opset 17; a higher one would shut older runtimes out for nothing."""
+"""The version that goes with opset 17; a higher one would exclude older runtimes."""
 ABOUT = (
     "Greedy policy of mjx_balance. The metadata's inputs say what each entry of the observation "
     "is, in order; the action is a row of actions.table_m in the metadata's manifest."
@@ -30,17 +28,17 @@ ABOUT = (
 
 
 def export_onnx(policy: Policy, path: Path) -> int:
-    """Writes a policy as an ONNX model, whole or not at all.
+    """Writes a policy as an ONNX model, atomically.
 
     Args:
-      policy: of any head.
-      path: where to.
+      policy: with any head.
+      path: file to write.
 
     Returns:
-      Size of the file in bytes.
+      Size of the file, bytes.
 
     Raises:
-      OSError: if it cannot be written; what was there before is then still there.
+      OSError: if it cannot be written; an old file then stays.
     """
     content = onnx_model(policy).SerializeToString()
     write_atomically(path, content)
@@ -48,12 +46,11 @@ def export_onnx(policy: Policy, path: Path) -> int:
 
 
 def onnx_model(policy: Policy) -> onnx.ModelProto:
-    """A policy as an ONNX model that onnx's own checker has passed.
+    """Returns a policy as a checked ONNX model.
 
-    Input `observation` (N, obs_size) float32; outputs `q_values` (N, num_actions) float32 and
-    `action` (N,) int64, for any N. Its metadata holds `manifest` and the rows of the observation,
-    `inputs`, as JSON. Whatever the observation, not finite ones included, the action is
-    one of the policy's.
+    Its input is `observation` (N, obs_size) float32; its outputs are `q_values` (N, num_actions)
+    float32 and `action` (N,) int64, for any N. The metadata holds `manifest` and `inputs` as JSON.
+    The action is valid for any observation, even one that is not finite.
     """
     graph = _Graph()
     x = "observation"
@@ -62,7 +59,7 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
     if policy.radial:
         x = graph.add("Concat", x, "observation", axis=1)
     out = graph.add("Gemm", x, *policy.layers[-1])
-    values, digits = (_radial if policy.radial else _added)(graph, out, policy)
+    values, digits = (_radial if policy.radial else _additive)(graph, out, policy)
     strides = [math.prod(policy.factors[k + 1 :]) for k in range(len(policy.factors))]
     graph.add("Identity", values, output="q_values")
     index = graph.add("Mul", digits, np.asarray(strides))
@@ -89,7 +86,7 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
 
 
 class _Graph:
-    """Operations and constants, in the order in which they are made."""
+    """Operations and constants of a graph."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -102,14 +99,14 @@ class _Graph:
         output: str = "",
         **attributes: Any,
     ) -> str:
-        """Adds an operation on earlier ones' outputs and on constants; returns its output."""
+        """Adds an operation; its inputs are names of outputs, or constants. Returns its output."""
         output = output or f"{kind}_{len(self.nodes)}"
         names = [x if isinstance(x, str) else self._constant(x) for x in inputs]
         self.nodes.append(helper.make_node(kind, names, [output], output, **attributes))
         return output
 
     def columns(self, x: str, start: int, end: int) -> str:
-        """(N, end - start) of x (N, n)."""
+        """Slices x (N, n) to (N, end - start)."""
         return self.add("Slice", x, *(np.asarray([k]) for k in (start, end, 1)))
 
     def _constant(self, value: np.ndarray | np.floating) -> str:
@@ -118,8 +115,8 @@ class _Graph:
         return name
 
 
-def _added(graph: _Graph, out: str, policy: Policy) -> tuple[str, str]:
-    """Values of all actions and digits of the best, as `heads.Added`."""
+def _additive(graph: _Graph, out: str, policy: Policy) -> tuple[str, str]:
+    """Values of all actions and digits of the best one, as `heads.Additive`."""
     ends = np.cumsum(policy.factors)
     branches = [
         graph.columns(out, end - levels, end)
@@ -136,7 +133,7 @@ def _added(graph: _Graph, out: str, policy: Policy) -> tuple[str, str]:
 
 
 def _radial(graph: _Graph, out: str, policy: Policy) -> tuple[str, str]:
-    """Values of all actions and digits of the best, as `heads.Radial`."""
+    """Values of all actions and digits of the best one, as `heads.Radial`."""
     value = graph.columns(out, 0, 1)
     mu = graph.columns(out, 1, 1 + len(policy.factors))
     alpha, beta, kappa, delta = np.logaddexp(policy.profile, np.zeros_like(policy.profile))
@@ -149,7 +146,7 @@ def _radial(graph: _Graph, out: str, policy: Policy) -> tuple[str, str]:
 
     zero, last = np.float32(0), np.asarray(policy.factors, np.float32) - 1
     at = graph.add("Mul", graph.add("Add", mu, np.float32(1)), last / 2)
-    # A cast of NaN is any integer; NumPy's head takes the first point.
+    # ONNX leaves the cast of NaN undefined; NumPy's head chooses the first point.
     at = graph.add("Where", graph.add("IsNaN", at), zero, at)
     nearest = graph.add("Min", graph.add("Max", graph.add("Round", at), zero), last)
     return values, graph.add("Cast", nearest, to=TensorProto.INT64)

@@ -10,7 +10,7 @@ import pytest
 from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import DQN, DQNSpec
 from mjx_balance.dqn.dqn import epsilon_greedy, exploration_noise, linear_epsilon
-from mjx_balance.policy.heads import Added
+from mjx_balance.policy.heads import Additive
 
 KEYS = jax.random.split(jax.random.PRNGKey(0), 20_000)
 
@@ -65,8 +65,8 @@ def test_noise_stops_at_the_ends() -> None:
 class Favourite:
     """A network of 9 actions that likes action 5 best."""
 
-    def apply(self, params: Any, obs: jax.Array, method: str) -> Added:
-        return Added(jax.nn.one_hot(5, 9), (9,))
+    def apply(self, params: Any, obs: jax.Array, method: str) -> Additive:
+        return Additive(jax.nn.one_hot(5, 9), (9,))
 
 
 def actions(epsilon: float, levels: int) -> np.ndarray:

@@ -81,15 +81,15 @@ def some_heads(batch: tuple[int, ...], seed: int) -> list[heads.Head]:
     )
     joint = rng.normal(size=(*batch, 24)).astype(np.float32)
     return [
-        heads.Added(joint, (24,)),
-        heads.Added(branches, factors),
+        heads.Additive(joint, (24,)),
+        heads.Additive(branches, factors),
         heads.Radial(out, profile, stretch, factors),
     ]
 
 
 def in_jax(head: heads.Head) -> heads.Head:
-    if isinstance(head, heads.Added):
-        return heads.Added(jnp.asarray(head.branches), head.factors)
+    if isinstance(head, heads.Additive):
+        return heads.Additive(jnp.asarray(head.branches), head.factors)
     out, profile, stretch = map(jnp.asarray, (head.out, head.profile, head.stretch))
     return heads.Radial(out, profile, stretch, head.factors)
 
@@ -132,7 +132,7 @@ def test_value_of_one_action_and_the_best_one_are_those_of_all_values(
 def test_what_is_not_a_number_is_worth_an_action_all_the_same() -> None:
     """A robot that diverged observes NaN; it is counted as fallen, and stops nobody."""
     for head in some_heads((2,), 0):
-        name = "branches" if isinstance(head, heads.Added) else "out"
+        name = "branches" if isinstance(head, heads.Additive) else "out"
         array = vars(head)[name].copy()
         array[0] = np.nan
         best = type(head)(**vars(head) | {name: array}).argmax()

@@ -14,7 +14,7 @@ from mjx_balance.config import DQNConfig
 from mjx_balance.dqn import DQN, DQNSpec
 from mjx_balance.dqn.dqn import make_optimizer, td_error
 from mjx_balance.dqn.replay import Transition
-from mjx_balance.policy.heads import Added
+from mjx_balance.policy.heads import Additive
 
 CONFIG = DQNConfig(learning_rate=0.1, learning_rate_end_share=0.1, max_grad_norm=2.0)
 Q_TM1, Q_T, SELECTOR = ([1.0, 2.0, 3.0], [4.0, -1.0, 2.0], [0.0, 9.0, 1.0])
@@ -29,10 +29,10 @@ ERRORS = [
 class Table:
     """A network whose parameters are the action values of every state, an integer."""
 
-    def apply(self, params: jax.Array, obs: jax.Array, method: str) -> Added:
+    def apply(self, params: jax.Array, obs: jax.Array, method: str) -> Additive:
         assert method == "head"
         values = params[obs[..., 0].astype(int)]
-        return Added(values, (values.shape[-1],))
+        return Additive(values, (values.shape[-1],))
 
 
 def table_loss(params: Any, target: Any, batch: Transition, config: DQNConfig) -> jax.Array:
@@ -45,8 +45,8 @@ def table_loss(params: Any, target: Any, batch: Transition, config: DQNConfig) -
 def test_td_error_by_hand(double: bool, terminated: float, error: float, compiled: bool) -> None:
     def one(*values: Any) -> jax.Array:
         q_tm1, a_tm1, r_t, discount_t, *others = map(jnp.asarray, values)
-        q_t, selector = (Added(x, (3,)) for x in others)
-        return td_error(Added(q_tm1, (3,)), a_tm1, r_t, discount_t, q_t, selector)
+        q_t, selector = (Additive(x, (3,)) for x in others)
+        return td_error(Additive(q_tm1, (3,)), a_tm1, r_t, discount_t, q_t, selector)
 
     function = jax.jit(one) if compiled else one
     discount_t = 0.1 * (1 - terminated)
