@@ -1,15 +1,15 @@
 """A Deep Q-Network as one jitted program: act, step, store, sample, update, copy.
 
 Mnih et al. 2015, https://www.nature.com/articles/nature14236, for thousands of envs at once: one
-iteration takes one decision of every env and makes the updates that the replay ratio asks for.
-Read `DQN.iteration` first.
+iteration steps every env once and makes as many updates as the replay ratio demands. Read
+`DQN.iteration` first.
 
-Envs and replay are sharded over a one-axis device mesh, parameters are replicated: each device
-steps its own envs, fills its own part of the replay and samples its own share of every batch;
-gradients are averaged. The devices are CPU cores or accelerators; the program is the same.
+Envs and replay are sharded over a one-axis device mesh of CPU cores or accelerators; parameters are
+replicated. Each device steps its own envs, fills its own part of the replay and samples its own
+share of every batch; gradients are averaged.
 
-Several seeds are several runs in one program: every array of the state gets a leading seed axis
-and the iteration is vmapped over it.
+With several seeds, every array of the state has a leading seed axis, and the iteration is vmapped
+over it.
 """
 
 import dataclasses
@@ -72,10 +72,10 @@ class DQNSpec:
     symmetries: Symmetries | None = None
     """Reflections of the env, for `config.mirror`."""
     action_factors: tuple[int, ...] | None = None
-    """Sizes of the digits of an action index, along which exploration noise moves it; None: one
+    """Number of levels of each digit of an action index, for the exploration noise; None: one
     digit."""
     first_reset: Reset | None = None
-    """Makes the envs at the start of a run; None: the env's own reset."""
+    """Reset at the start of a run; None: `Env.reset`."""
     sweep: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
     """Field of `config` -> its value in every run."""
 
@@ -99,7 +99,7 @@ class DQNSpec:
 
     @property
     def total_updates(self) -> int:
-        """Gradient steps of the whole run; the last iteration counts whole."""
+        """Gradient steps of the whole run, the number of iterations rounded up."""
         return -(-self.num_env_steps // self.num_envs) * self.updates_per_iteration
 
     def per_device(self, count: int) -> int:
@@ -108,18 +108,18 @@ class DQNSpec:
 
 
 class TrainState(NamedTuple):
-    """The whole state of a run: saving it saves the run.
+    """The complete state of a run, for checkpoints.
 
-    With several seeds, every leaf has a leading axis of that size.
+    With several seeds, every leaf has a leading seed axis.
     """
 
     params: Params
-    """Of a network that takes whitened observations, with `whiten_steps`."""
+    """For whitened observations, if `whiten_steps` is positive."""
     target_params: Params
-    """Of a network that takes raw observations: a copy keeps the whitening of its time."""
+    """For raw observations: each copy includes the whitening at its time."""
     opt_state: optax.OptState
     statistics: RunningStatistics
-    """Of the observations."""
+    """Statistics of the observations."""
     env_state: State
     """(num_envs, ...) per leaf, sharded."""
     replay: ReplayState
@@ -187,13 +187,13 @@ class DQN:
     def train_program(
         self, iterations: int
     ) -> Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]:
-        """The jitted training program: state -> (state, metrics), the state donated.
+        """Returns the jitted training program: state -> (state, metrics), with the state donated.
 
-        Metrics are means over the call, with a leading seed axis if there are several seeds; NaN
-        without a value, as the loss of a call without an update.
+        Metrics are means over the call, with a leading seed axis if there are several seeds. A
+        metric without values is NaN, e.g. the loss of a call without updates.
 
-        Wait for a result every few calls: XLA starts at most 32 launches of CPU devices at once,
-        and a launch waits for ever for a device whose own is not started.
+        Wait for a result every few calls: XLA runs at most 32 launches of CPU devices at once, and
+        launches that wait for one that has not started deadlock.
 
         Args:
           iterations: decisions of every env per call.
@@ -201,7 +201,7 @@ class DQN:
         iteration = self._each_seed(self.iteration, in_axes=(0, None))
 
         def step(state: TrainState, _: None) -> tuple[TrainState, Means]:
-            # The same for all seeds: asked here, the branch not taken costs nothing.
+            # The same for all seeds. Inside the vmap, `cond` would run both branches.
             observing = state.env_steps.max() < self.spec.config.whiten_steps
             return iteration(state, observing)
 
@@ -216,13 +216,13 @@ class DQN:
         )
 
     def export_params(self, state: TrainState) -> Params:
-        """Parameters of one run (no seed axis) for a network that takes raw observations."""
+        """Returns the parameters of one run (no seed axis) for raw observations."""
         return jax.jit(self.fold)(state.params, state.statistics)
 
     def _each_seed(self, function: Callable[..., Any], in_axes: Any = 0) -> Callable[..., Any]:
         return jax.vmap(function, in_axes) if self.spec.num_seeds > 1 else function
 
-    # The rest is about one run and runs on each device.
+    # The methods below handle one run, on each device.
 
     def initial_state(self, key: PRNGKeyArray, sweep: dict[str, jax.Array]) -> TrainState:
         """The state of a new run."""
@@ -253,12 +253,15 @@ class DQN:
         """One decision of every env, then the updates.
 
         Args:
-          state: of one run, this device's part.
-          observing: whether observations still add to the statistics.
+          state: this device's part of the state of one run.
+          observing: whether to add the observations to the statistics.
+
+        Returns:
+          The state and the metrics of the iteration.
         """
         key, key_act, key_reset, key_update = jax.random.split(state.key, 4)
         swept: Any = state.sweep
-        config = dataclasses.replace(self.spec.config, **swept)  # swept fields hold arrays
+        config = dataclasses.replace(self.spec.config, **swept)  # swept fields are arrays
         obs = as_array(state.env_state.obs)
         statistics = jax.lax.cond(
             observing,
@@ -348,16 +351,16 @@ class DQN:
         statistics: RunningStatistics,
         config: DQNConfig,
     ) -> tuple[UpdateState, Mean]:
-        """One gradient step on a batch of which each device has its share.
+        """One gradient step.
 
         Args:
           state: the same on every device, before and after.
-          batch: (share, ...) per field.
-          statistics: of the observations so far.
+          batch: this device's share, (share, ...) per field.
+          statistics: of the observations.
           config: the algorithm.
 
         Returns:
-          The state, unchanged if loss or gradient are not finite; the loss over all devices, a
+          The state, unchanged if loss or gradient are not finite; the loss over all devices, as a
           mean with count 1, or 0 if the step was skipped.
         """
 
@@ -366,7 +369,7 @@ class DQN:
 
         loss: jax.Array
         loss, grads = mean_over_devices(jax.value_and_grad(loss_of)(state.params))
-        # The cosine runs over the updates of a whole run; none is made before the warm-up.
+        # The schedule counts the iterations of the warm-up too, though they make no updates.
         optimizer = make_optimizer(config, self.spec.total_updates)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
@@ -384,9 +387,9 @@ class DQN:
     def loss(
         self, params: Params, target_params: Params, batch: Transition, config: DQNConfig
     ) -> Float[Array, ""]:
-        """Mean squared TD error of a batch; beyond `huber_delta`, the square's tangent there.
+        """Mean squared TD error of a batch, or twice the Huber loss with `huber_delta`.
 
-        With `double`, the online network selects the action that the target network values.
+        With `double`, the online network selects the action that the target network evaluates.
         """
 
         def error(t: Transition) -> jax.Array:
@@ -401,13 +404,13 @@ class DQN:
         return 2 * jnp.mean(optax.losses.huber_loss(errors, delta=config.huber_delta))
 
     def head(self, params: Params, obs: Float[Array, "*batch obs"]) -> Head:
-        """The network's action values of raw observations."""
+        """The network's head for raw observations."""
         head = self.network.apply(params, obs, method="head")
         assert isinstance(head, Head)
         return head
 
     def fold(self, params: Params, statistics: RunningStatistics) -> Params:
-        """Folds the whitening into the parameters: one small kernel instead of every input."""
+        """Folds the whitening into the parameters, which is cheaper than whitening every input."""
         if not self.spec.config.whiten_steps:
             return params
         return self.network.fold_whitening(params, statistics.mean, statistics.matrix)
@@ -438,7 +441,7 @@ def td_error(
 
 
 def make_optimizer(config: DQNConfig, gradient_steps: int) -> optax.GradientTransformation:
-    """Adam with clipped gradients and a cosine from learning_rate to its end share."""
+    """Adam with clipped gradients and a cosine decay of the learning rate to its end share."""
     schedule = optax.cosine_decay_schedule(
         config.learning_rate, max(gradient_steps, 1), config.learning_rate_end_share
     )
@@ -450,7 +453,7 @@ def linear_epsilon(config: DQNConfig, env_steps: Int[Array, ""]) -> Float[Array,
 
     epsilon = start + (end - start) * min(env_steps / epsilon_decay_steps, 1)
     """
-    # optax.linear_schedule branches on its number of steps, which is an array in a sweep.
+    # optax.linear_schedule branches on the number of steps, which is an array in a sweep.
     share = jnp.minimum(env_steps / config.epsilon_decay_steps, 1.0)
     return config.epsilon_start + (config.epsilon_end - config.epsilon_start) * share
 
@@ -458,7 +461,7 @@ def linear_epsilon(config: DQNConfig, env_steps: Int[Array, ""]) -> Float[Array,
 def epsilon_greedy(
     key: PRNGKeyArray, greedy: jax.Array, epsilon: jax.Array, num_actions: int
 ) -> Int[Array, ""]:
-    """The action index `greedy`, or with probability `epsilon` a uniformly random one."""
+    """Returns the action index `greedy`, or with probability `epsilon` a uniformly random one."""
     key_which, key_random = jax.random.split(key)
     random = jax.random.randint(key_random, (), 0, num_actions)
     return jnp.where(jax.random.bernoulli(key_which, epsilon), random, greedy.astype(random.dtype))
@@ -467,16 +470,16 @@ def epsilon_greedy(
 def exploration_noise(
     key: PRNGKeyArray, action: jax.Array, factors: Sequence[int], levels: int
 ) -> Int[Array, ""]:
-    """Moves an action by up to `levels` on each factor of its index, uniformly.
+    """Moves each digit of an action index by up to `levels`, uniformly.
 
-    A greedy action alone shows a reward near its peak, which tells how far off it was but
-    not to which side; its neighbours tell that.
+    The reward of a greedy action shows its distance from the best action, but not the direction;
+    the rewards of its neighbours show the direction.
 
     Args:
       key: PRNG key.
       action: index, a mixed-radix number.
-      factors: sizes of its digits.
-      levels: greatest move; digits stop at their ends.
+      factors: number of levels of each digit.
+      levels: greatest move; digits are clipped.
     """
     move = jax.random.randint(key, (len(factors),), -levels, levels + 1)
     digits = jnp.stack(jnp.unravel_index(action, tuple(factors))) + move
@@ -490,17 +493,17 @@ class Step(NamedTuple):
     env_state: State
     """(envs, ...) per leaf, done envs reset."""
     transition: Transition
-    """(envs, ...) per field, before any reset; a diverged env's row repeats another env's."""
+    """(envs, ...) per field, before any reset; the row of a diverged env repeats another env's."""
     valid: Bool[Array, ""]
     """Whether every device has an env that did not diverge."""
     metrics: Means
-    """Over all devices: the env's own, `reward`, and `diverged`, the share of diverged envs."""
+    """Means over all devices: the env's, `reward`, and `diverged`, the share of diverged envs."""
 
 
 def step(env: Env, state: State, action: Int[Array, " envs"], key: PRNGKeyArray) -> Step:
     """Steps this device's envs once and resets those that are done.
 
-    An env whose transition is not finite has diverged: it is done, and not stored.
+    An env has diverged if its transition is not finite; it is done, and its transition is dropped.
 
     Args:
       env: unbatched.
@@ -546,10 +549,10 @@ def reset_done(reset: Reset, state: State, key: PRNGKeyArray) -> State:
 
 
 def as_array(obs: object) -> jax.Array:
-    """The observation of an env; brax allows dictionaries, this DQN takes arrays.
+    """Returns an observation that is an array; brax also allows dictionaries.
 
     Raises:
-      TypeError: for anything else.
+      TypeError: if it is not an array.
     """
     if not isinstance(obs, jax.Array):
         raise TypeError(f"the env observes {type(obs).__name__}; this DQN takes arrays")

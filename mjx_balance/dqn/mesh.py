@@ -1,4 +1,4 @@
-"""The one mesh axis of the program: a function on every device, means over all devices."""
+"""Device mesh of one axis: runs functions on every device, and computes means over all devices."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -17,9 +17,9 @@ T = TypeVar("T")
 def on_each_device(
     function: Callable[..., Any], mesh: Mesh, in_specs: Any, out_specs: Any
 ) -> Callable[..., Any]:
-    """A function that runs `function` on every device of the mesh; see `jax.shard_map`."""
-    # Jitted, its constants stay inside it: over an empty one (the indices of `x.at[:].set`) among
-    # the operands, Shardy of JAX 0.11 crashes on two CPU devices.
+    """Returns a function that runs `function` on every device of the mesh (`jax.shard_map`)."""
+    # The inner jit keeps constants from becoming operands: with an empty one (the indices of
+    # `x.at[:].set`), Shardy of JAX 0.11 crashes on two CPU devices.
     inner = jax.jit(function, inline=True)
     return jax.shard_map(inner, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
@@ -30,10 +30,10 @@ def device_key(key: PRNGKeyArray) -> PRNGKeyArray:
 
 
 def mean_over_devices(tree: T) -> T:
-    """Mean over the devices of every array, in one exchange: devices wait for each other once.
+    """Mean of every array over the devices, in one collective.
 
-    CPUs give all to all, which takes half the steps of a sum in a ring, and add up in the devices'
-    order, however many processes they belong to; accelerators use their own library's mean.
+    On CPUs, an all-gather has half the steps of a ring reduction, and its sum follows the order of
+    the devices, whatever the number of processes. Accelerators use `pmean`.
     """
     flat, unflatten = ravel_pytree(tree)
     mean = jax.lax.platform_dependent(
@@ -45,7 +45,7 @@ def mean_over_devices(tree: T) -> T:
 
 
 class Mean(NamedTuple):
-    """A mean as total and number of values: those of parts add up to those of the whole."""
+    """A mean as total and number of values, so that means of parts can be summed."""
 
     total: Float[Array, ""]
     number: Float[Array, ""]

@@ -1,8 +1,8 @@
-"""Running statistics of the observations, and the whitening that follows from them.
+"""Running statistics of the observations, and their whitening.
 
-Neighbouring sensor samples are nearly equal, and their difference tells a tilt from a sway.
-Without whitening, directions of small variance take orders of magnitude longer to learn
-(LeCun et al. 1998, "Efficient BackProp", section 4.3).
+Neighbouring sensor samples are nearly equal, and their small difference distinguishes a tilt from a
+sway. Without whitening, a network learns directions of small variance orders of magnitude more
+slowly (LeCun et al. 1998, "Efficient BackProp", section 4.3).
 """
 
 from typing import NamedTuple
@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from mjx_balance.dqn.mesh import AXIS, all_finite
 
 RECENCY = 4.0
-"""Batch k weighs about k^(RECENCY - 1): the last quarter of the batches weighs most, the first
-random actions hardly at all."""
+"""The weight of batch k grows as k^(RECENCY - 1): the first batches, of random actions, hardly
+count."""
 
 
 class RunningStatistics(NamedTuple):
@@ -24,9 +24,9 @@ class RunningStatistics(NamedTuple):
     mean: Float[Array, " obs"]
     covariance: Float[Array, "obs obs"]
     batches: Float[Array, ""]
-    """Batches so far."""
+    """Number of batches."""
     matrix: Float[Array, "obs obs"]
-    """Whitens: (obs - mean) @ matrix."""
+    """(obs - mean) @ matrix is white."""
 
 
 def init(obs_size: int, floor: float) -> RunningStatistics:
@@ -39,7 +39,13 @@ def init(obs_size: int, floor: float) -> RunningStatistics:
 def observe(
     statistics: RunningStatistics, obs: Float[Array, "envs obs"], floor: float
 ) -> RunningStatistics:
-    """Adds the finite observations of all devices as one batch; runs on each device."""
+    """Adds the finite observations of all devices as one batch.
+
+    Args:
+      statistics: so far.
+      obs: this device's observations.
+      floor: see `whitening_matrix`.
+    """
     mask = jax.vmap(all_finite)(obs)[:, None]
     count = jax.lax.psum(mask.sum(), AXIS)
     mean: jax.Array = jax.lax.psum(jnp.where(mask, obs, 0.0).sum(axis=0), AXIS) / count
@@ -57,15 +63,15 @@ def observe(
             statistics.batches + 1,
             whitening_matrix(covariance, floor),
         )
-    usable = all_finite(new)  # not without observations, nor if their squares overflow
+    usable = all_finite(new)  # false without finite observations, or if their squares overflow
     return jax.tree.map(lambda new, old: jnp.where(usable, new, old), new, statistics)
 
 
 def whitening_matrix(covariance: Float[Array, "obs obs"], floor: float) -> Float[Array, "obs obs"]:
-    """The symmetric whitening matrix (covariance + floor)^(-1/2).
+    """The symmetric whitening matrix (covariance + floor * identity)^(-1/2).
 
-    Of all whitening matrices it changes the inputs least, and it changes smoothly with
-    the covariance (Kessy et al. 2018, https://arxiv.org/abs/1512.00809, section 3.1).
+    Of all whitening matrices it changes the inputs least, and it is a smooth function of the
+    covariance (Kessy et al. 2018, https://arxiv.org/abs/1512.00809, section 3.1).
     """
     values, vectors = jnp.linalg.eigh(covariance)
     return (vectors / jnp.sqrt(jnp.maximum(values, 0.0) + floor)) @ vectors.T

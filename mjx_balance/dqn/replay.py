@@ -1,8 +1,7 @@
 """A uniform replay buffer as a frozen state and pure functions: `init`, `add`, `sample`.
 
-Transitions arrive in batches of a fixed size, one per env. The capacity is a
-whole number of batches, so a write is always one contiguous block and never
-wraps in its middle.
+Transitions arrive in batches of a fixed size, one row per env. The capacity is a whole number of
+batches, so every write is one contiguous block.
 """
 
 from typing import NamedTuple, Protocol
@@ -21,7 +20,8 @@ class Transition(NamedTuple):
     """Index, int32."""
     reward: Float[Array, "*rows"]
     terminated: Float[Array, "*rows"]
-    """1 after a termination, 0 after a time-out: only the first stops bootstrapping."""
+    """1 after a termination, 0 otherwise, also after a truncation: only terminations stop
+    bootstrapping."""
     next_obs: Float[Array, "*rows obs"]
     """The observation before any reset."""
 
@@ -34,7 +34,7 @@ class ReplayState(NamedTuple):
     position: Int[Array, ""]
     """Row at which the next batch starts."""
     size: Int[Array, ""]
-    """Rows that hold transitions."""
+    """Number of rows with transitions."""
 
 
 def init(example: Transition, capacity: int, batch: int) -> ReplayState:
@@ -61,7 +61,7 @@ def add(state: ReplayState, batch: Transition, valid: Bool[Array, ""] | bool = T
     Args:
       state: the buffer.
       batch: (batch, ...) per field.
-      valid: if false, the buffer stays as it is.
+      valid: if false, the buffer does not change.
 
     Raises:
       ValueError: if the batch does not divide the capacity.
@@ -85,28 +85,25 @@ def add(state: ReplayState, batch: Transition, valid: Bool[Array, ""] | bool = T
 
 
 def sample(state: ReplayState, key: PRNGKeyArray, batch_size: int) -> Transition:
-    """Draws (batch_size, ...) transitions uniformly, with replacement, from a buffer not empty."""
+    """Draws (batch_size, ...) transitions uniformly with replacement; the buffer is not empty."""
     rows = jax.random.randint(key, (batch_size,), 0, state.size)
     return jax.tree.map(lambda ring: ring.at[rows].get(mode="promise_in_bounds"), state.data)
 
 
 class Symmetries(Protocol):
-    """The group of the env's reflections, g of them, the identity included."""
+    """The g reflections of an env, including the identity.
+
+    Reflection k maps obs to obs[obs_index[k]] * obs_sign[k], and action to action_index[k, action].
+    """
 
     @property
-    def obs_index(self) -> Int[np.ndarray, "g obs"]:
-        """Entry of the observation that moves to each place."""
-        ...
+    def obs_index(self) -> Int[np.ndarray, "g obs"]: ...
 
     @property
-    def obs_sign(self) -> Float[np.ndarray, "g obs"]:
-        """Its sign there."""
-        ...
+    def obs_sign(self) -> Float[np.ndarray, "g obs"]: ...
 
     @property
-    def action_index(self) -> Int[np.ndarray, "g actions"]:
-        """Index that each action becomes."""
-        ...
+    def action_index(self) -> Int[np.ndarray, "g actions"]: ...
 
 
 def reflect(batch: Transition, symmetries: Symmetries, key: PRNGKeyArray) -> Transition:

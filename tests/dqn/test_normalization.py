@@ -75,7 +75,7 @@ def test_whitened_observations_are_uncorrelated_and_of_equal_size() -> None:
     np.testing.assert_allclose(np.cov(white.T), np.eye(3), atol=0.15)
 
 
-@pytest.mark.parametrize("hidden", [(8, 6), (8,), ()])
+@pytest.mark.parametrize("hidden", [(8, 6), (8,)])
 @pytest.mark.parametrize("radial", [False, True])
 def test_folded_parameters_take_raw_observations(radial: bool, hidden: tuple[int, ...]) -> None:
     rng = np.random.default_rng(0)
