@@ -189,6 +189,7 @@ def test_an_episode_is_that_of_balance_env(
     for seed in (1, 2):
         actions = np.full(40, LEFT_UP) if falls else random_actions(seed, 40, 1)
         seen = walk(env, actions, seed)
+        assert env.batch is not None
         params = env.batch.state.params
         delays.append(0 if params is None else params.delay[0])
         states = driven(config, env.batch, actions[: len(seen) - 1])

@@ -35,10 +35,10 @@ def make_view(
     roll_pitch_yaw: np.ndarray,
     rates: np.ndarray | None = None,
     imu: np.ndarray | None = None,
-    decision: int = 0,
+    env_steps: int = 0,
     ids: np.ndarray | None = None,
     targets: np.ndarray | None = None,
-    late: np.ndarray | None = None,
+    delayed: np.ndarray | None = None,
 ) -> View:
     """What n made-up worlds look like: attitudes (n, 3) in deg, body rates (n, 3) in deg/s."""
     n = len(roll_pitch_yaw)
@@ -50,7 +50,7 @@ def make_view(
         qvel[:, root + 3 : root + 6] = np.radians(rates)
     return View(
         ids=np.arange(n) if ids is None else ids,
-        decision=decision,
+        env_steps=env_steps,
         obs=np.zeros((n, 34)),
         imu=np.tile(scene.stance.imu, (n, 50, 1)) if imu is None else imu,
         qpos=qpos,
@@ -58,7 +58,7 @@ def make_view(
         scenario=Scenario(
             np.zeros((n, 2, 2)) if targets is None else targets, np.zeros(n), np.full(n, 3.5)
         ),
-        late=np.zeros(n, bool) if late is None else late,
+        delayed=np.zeros(n, bool) if delayed is None else delayed,
     )
 
 
@@ -117,7 +117,7 @@ def test_complementary_filter_sample_by_sample(scene: Scene) -> None:
             scene,
             np.zeros((len(ids), 3)),
             imu=np.concatenate((gyro, accel), axis=-1),
-            decision=decision,
+            env_steps=decision,
             ids=np.asarray(ids),
         )
         got, rate = controller.state(view)
@@ -129,7 +129,7 @@ def test_filter_starts_anew_with_every_evaluation(scene: Scene) -> None:
     controller = ImuPD(scene)
     tilted = np.tile((0.5, 0.5, 0.0, 1.0, 1.0, 9.7), (2, 50, 1))
     first = controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted))[0]
-    controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted, decision=1))
+    controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted, env_steps=1))
     again = controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted))[0]
     np.testing.assert_array_equal(first, again)
 
@@ -179,9 +179,9 @@ def test_plans_are_the_least_squares_optimum(
         view = make_view(
             scene,
             np.asarray([(*attitude, 30.0)]),
-            decision=decision,
+            env_steps=decision,
             targets=targets,
-            late=np.asarray([late]),
+            delayed=np.asarray([late]),
         )
         action = controller(view)
         step = np.arange(1, 401)

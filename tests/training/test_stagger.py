@@ -30,4 +30,4 @@ def test_a_later_episode_has_its_whole_length(fleet: Any) -> None:
 
 def test_a_run_begins_with_staggered_episodes(fleet: Any) -> None:
     sized = size_to_device(dataclasses.replace(fleet.env.config, num_envs=ENVS))
-    assert make_learner(sized, fleet.env).first_reset == fleet.env.reset_staggered
+    assert make_learner(sized, fleet.env).spec.first_reset == fleet.env.reset_staggered
