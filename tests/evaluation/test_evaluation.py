@@ -745,7 +745,8 @@ def test_imu_noise_has_the_size_asked_for_and_is_seen_by_the_controller(
         seen.append(view)
         return np.full(len(view.ids), STAND)
 
-    roll_out(scene, watch, Episodes(level, noisy), 1.0)
+    rngs = [np.random.default_rng((0, k, 1)) for k in range(40)]
+    roll_out(scene, watch, Episodes(level, noisy, rngs=rngs), 1.0)
     imu = seen[-1].imu
     assert imu.shape == (40, 50, 6)
     np.testing.assert_allclose(imu[..., :3].std(), 0.002, rtol=0.05)
