@@ -17,7 +17,7 @@ from mjx_balance.robots.build import build, model_path, scene_dir
 from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, shipped
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.limits import for_robot
-from mjx_balance.robots.schema import parse_robot_file
+from mjx_balance.robots.schema import Foot, parse_robot_file
 from mjx_balance.sim.scene import load_scene
 
 MAKERS = tuple(name for name in shipped() if name != "quadruped")
@@ -93,7 +93,8 @@ def test_feet_that_are_no_spheres(draw: Any, tmp_path: Path, robot: Robot) -> No
         )
     text, found = drafted(spec, tmp_path)
     foot = parse_robot_file(text, tmp_path / "drafted.toml").legs[0].foot
-    assert foot.name == "LF_calf"
+    assert isinstance(foot, Foot)
+    assert foot.body == "LF_calf"
     assert foot.offset == pytest.approx((0, 0, -0.215), abs=1e-9)
     assert "foot_radius = 0.02" in text
     assert found.legs[0].calf == pytest.approx(0.215, abs=1e-6)
