@@ -125,7 +125,7 @@ def test_warp_is_refused_where_it_has_no_kernels(monkeypatch: pytest.MonkeyPatch
 def test_as_many_devices_as_share_evenly(
     num_envs: int, batch_size: int, available: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cpus = [types.SimpleNamespace(platform="cpu")] * available
+    cpus = [types.SimpleNamespace(platform="cpu", device_kind="cpu")] * available
     monkeypatch.setattr(jax, "devices", lambda: cpus)
     sized = size_to_device(with_batch(batch_size, num_envs=num_envs))
     assert sized.num_devices == expected
