@@ -76,6 +76,7 @@ def test_tests_of_a_module_import_it_the_nearest_first() -> None:
     assert len({*first, *further}) == len(first) + len(further)
 
 
+@pytest.mark.slow
 def test_mutants_are_drawn_from_the_whole_package_and_are_python() -> None:
     drawn = mutants.drawn(12, 3, 1.0)
     assert drawn == mutants.drawn(12, 3, 1.0) != mutants.drawn(12, 4, 1.0)
