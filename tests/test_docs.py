@@ -346,6 +346,9 @@ def test_snippets_run(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
                 run_yaml(snippet.text, capsys)
             elif kind == "toml":
                 check_toml(snippet.text)
+            elif kind == "diff":  # of a worked example: it applies to today's code
+                check = ("git", "apply", "--check", "-C1", "-")
+                subprocess.run(check, input=snippet.text, text=True, check=True, cwd=REPO)
             elif kind == "text":  # what the commands before it say
                 assert snippet.text.strip() == said.strip()
             else:
