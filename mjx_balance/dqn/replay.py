@@ -97,13 +97,19 @@ class Symmetries(Protocol):
     """
 
     @property
-    def obs_index(self) -> Int[np.ndarray, "g obs"]: ...
+    def obs_index(self) -> Int[np.ndarray, "g obs"]:
+        """Entry of the observation that comes to each place."""
+        ...
 
     @property
-    def obs_sign(self) -> Float[np.ndarray, "g obs"]: ...
+    def obs_sign(self) -> Float[np.ndarray, "g obs"]:
+        """Its sign there, 1 or -1."""
+        ...
 
     @property
-    def action_index(self) -> Int[np.ndarray, "g actions"]: ...
+    def action_index(self) -> Int[np.ndarray, "g actions"]:
+        """Index that each action becomes."""
+        ...
 
 
 def reflect(batch: Transition, symmetries: Symmetries, key: PRNGKeyArray) -> Transition:
