@@ -21,11 +21,7 @@ def to_dict(section: Any) -> dict[str, Any]:
 
 
 def from_dict(kind: type[T], values: Any) -> T:
-    """Builds a `kind` from `to_dict`'s values; missing fields take their defaults.
-
-    Args:
-      kind: `Config` or the class of a section.
-      values: JSON values.
+    """Builds a dataclass from `to_dict`'s values; missing fields take their defaults.
 
     Raises:
       ConfigError: if a field is unknown, or a value has the wrong type or is out of bounds.
@@ -42,11 +38,7 @@ def flatten(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_config(file: Path) -> Config:
-    """Reads and checks a config.json.
-
-    Raises:
-      ValueError: if the file is not JSON or not a valid config.
-    """
+    """Reads and checks a config.json; raises ValueError if it is not JSON or not valid."""
     return check(from_dict(Config, read_json(file)))
 
 

@@ -1,7 +1,5 @@
 """Checks of a config that do not depend on the robot."""
 
-from typing import Any
-
 from mjx_balance.config.presets import preset
 from mjx_balance.config.schema import Config, ConfigError, RandomizationConfig, TaskConfig
 from mjx_balance.config.sweep import sweep_grid, with_values
@@ -22,7 +20,7 @@ def check(config: Config) -> Config:
         raise ConfigError(
             f"config is {quote(config)}; it must be a Config, as `preset` and `for_robot` return"
         )
-    _check_fields(config.task, config.randomization, config.dqn, config)
+    check_types(config, ConfigError)
     preset(config.preset)
     _check_runs(config)
     _check_timing(config.task)
@@ -36,15 +34,10 @@ def check(config: Config) -> Config:
     return config
 
 
-def _check_fields(*sections: Any) -> None:
-    for section in sections:
-        check_types(section, ConfigError)
-
-
 def _check_runs(config: Config) -> None:
     grid = sweep_grid(config)
     for values in grid:
-        _check_fields(with_values(config.dqn, values))
+        check_types(with_values(config.dqn, values), ConfigError)
     runs = len(grid) * config.num_seeds
     if config.sweep and runs == 1:
         raise ConfigError(

@@ -71,22 +71,21 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     Raises:
       OSError: if it cannot be written; the old content then stays.
     """
-    data, part = content.encode() if isinstance(content, str) else content, None
+    data = content.encode() if isinstance(content, str) else content
+    target = path.resolve()
+    part = target.with_name(f"{target.name}.part")
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             path.write_bytes(data)
             return
-        target = path.resolve()
-        part = target.with_name(f"{target.name}.part")
         with part.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         part.replace(target)
     except OSError as error:
-        if part is not None:
-            with contextlib.suppress(OSError):
-                part.unlink()
+        with contextlib.suppress(OSError):
+            part.unlink()
         error.filename = str(path)  # the user knows no .part file
         raise
 
@@ -99,12 +98,7 @@ def write_json(path: Path, values: Any) -> None:
 def create_run_folder(
     path: Path, config: Mapping[str, Any], provenance: Mapping[str, Any]
 ) -> RunFolder:
-    """Creates a run folder with config and provenance; the rename at the end makes it atomic.
-
-    Args:
-      path: the folder.
-      config: JSON values.
-      provenance: JSON values; see `check_same_provenance`.
+    """Creates a run folder with config and provenance (`check_same_provenance`), atomically.
 
     Raises:
       RunFolderError: if the folder exists or cannot be written; nothing changes then.
@@ -131,10 +125,9 @@ def create_run_folder(
 
 @contextlib.contextmanager
 def locked(folder: RunFolder) -> Iterator[None]:
-    """Locks a run against other processes; the operating system unlocks it if this one dies.
+    """Locks a run against other processes; raises `RunFolderError` if another one holds the lock.
 
-    Raises:
-      RunFolderError: if another process holds the lock.
+    The operating system unlocks it if this process dies.
     """
     with folder.lock.open("a+b") as file:
         try:
@@ -153,11 +146,7 @@ def locked(folder: RunFolder) -> Iterator[None]:
 
 
 def unfinished_run(path: Path) -> RunFolder:
-    """Returns the folder of a run that can be resumed.
-
-    Raises:
-      RunFolderError: if `path` is not a run folder, or its run is finished.
-    """
+    """Returns the folder of a run that can be resumed; raises `RunFolderError` for any other."""
     folder = RunFolder(path)
     if not folder.config.is_file():
         raise RunFolderError(f"{path} is no run folder: it has no config.json")
@@ -167,22 +156,18 @@ def unfinished_run(path: Path) -> RunFolder:
 
 
 def read_json(file: Path) -> Any:
-    """Reads a JSON file of a run.
-
-    Raises:
-      ValueError: if the file is missing, unreadable, too large or not JSON.
-    """
+    """Reads a JSON file of a run; raises ValueError if it is unreadable, too large or not JSON."""
     try:
         with file.open("rb") as opened:
             content = opened.read(READ_AT_MOST + 1)
-        if len(content) > READ_AT_MOST:
-            raise ValueError(
-                f"it is {file.stat().st_size / 2**20:.1f} MiB long; at most "
-                f"{READ_AT_MOST / 2**20:.0f} MiB are read"
-            )
-        return parse_json(content)
+        size = file.stat().st_size / 2**20
     except OSError as error:
         raise ValueError(str(error.strerror)) from error
+    if len(content) > READ_AT_MOST:
+        raise ValueError(
+            f"it is {size:.1f} MiB long; at most {READ_AT_MOST / 2**20:.0f} MiB are read"
+        )
+    return parse_json(content)
 
 
 def parse_json(content: bytes) -> Any:

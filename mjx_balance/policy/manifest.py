@@ -12,7 +12,7 @@ from mjx_balance.config import ACTION_AXES, Config, ConfigError, check, from_dic
 from mjx_balance.errors import InputError
 from mjx_balance.files.text import quote
 from mjx_balance.policy import heads
-from mjx_balance.robots.catalogue import Robot, find_robot, robot_from_dict
+from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import check_robot
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import input_rows
@@ -114,7 +114,7 @@ def config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
             right = {dict: "a JSON object", str: "a string"}[kind]
             raise PolicyError(f"its {name} is {quote(manifest.get(name))}; it must be {right}")
     try:
-        robot = robot_from_dict(manifest["robot"])
+        robot = from_dict(Robot, manifest["robot"])
     except ValueError as error:
         raise PolicyError(f"its robot cannot be used: {error}") from error
     try:

@@ -1,4 +1,4 @@
-"""Renders rollouts offscreen to pictures and videos, and plays them in a window. No JAX.
+"""Renders states offscreen to pictures and videos, and plays them in a window. No JAX.
 
 MuJoCo chooses its OpenGL backend on import, and a broken backend can crash the process. So this
 file renders in a child process (`python -m mjx_balance.render.drawing`): first with EGL, then with
@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,6 @@ VIDEO_SIZE = (960, 544)
 PICTURE_SIZE = (1280, 720)
 BACKENDS = ("egl", "osmesa")
 CHILD = (sys.executable, "-m", "mjx_balance.render.drawing")
-WRITE_FAILED = 3
-"""Exit code of the child process if it can draw but not write."""
 
 
 class RenderError(RuntimeError):
@@ -40,9 +38,7 @@ class RenderError(RuntimeError):
 
 
 def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") -> None:
-    """Draws the first state to a `.png` file, or all states to a video.
-
-    The write is atomic.
+    """Draws the first state to a `.png` file, or all states to a video, atomically.
 
     Args:
       path: file to write; any suffix but `.png` makes a video, at real speed.
@@ -53,76 +49,62 @@ def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") ->
     Raises:
       RenderError: if no OpenGL backend works here, or the file cannot be written.
     """
-    stride = frame_stride(config)
-    with tempfile.TemporaryDirectory() as folder:
-        job, picture = Path(folder) / "job.npz", Path(folder) / f"picture{path.suffix}"
-        header = {"config": to_dict(config), "camera": camera, "path": str(picture)}
-        header["fps"] = 1 / (stride * config.task.sim_dt)
-        np.savez(job, qpos=qpos[::stride], header=json.dumps(header))
-        reason = ""
-        for environment in _environments():
-            command = [*CHILD, str(job)]
-            done = subprocess.run(command, env=environment, capture_output=True, text=True)
-            reason = done.stderr
-            if done.returncode == WRITE_FAILED:
-                raise RenderError(f"{path} cannot be written: {_last_line(reason)}")
-            if done.returncode == 0:
-                try:
-                    return write_atomically(path, picture.read_bytes())
-                except OSError as error:
-                    raise RenderError(f"{path} cannot be written: {error.strerror}") from error
-    raise _render_error(reason)
+    import imageio.v2 as imageio
+
+    is_picture, stride = path.suffix == ".png", frame_stride(config)
+    painter = Painter(config, camera, PICTURE_SIZE if is_picture else VIDEO_SIZE)
+    with contextlib.closing(painter), tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"drawn{path.suffix}"
+        try:
+            if is_picture:
+                imageio.imwrite(file, painter.draw(qpos[0]))
+            else:
+                fps = 1 / (stride * config.task.sim_dt)
+                with imageio.get_writer(file, fps=fps, quality=8) as writer:
+                    for state in qpos[::stride]:
+                        writer.append_data(painter.draw(state))
+            write_atomically(path, file.read_bytes())
+        except OSError as error:
+            raise RenderError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 class Painter:
     """Draws states one by one in a child process, which runs until `close`."""
 
-    def __init__(self, config: Config, camera: str = "main"):
+    def __init__(self, config: Config, camera: str = "main", size: tuple[int, int] = VIDEO_SIZE):
         """Starts the process.
 
         Args:
           config: defines the scene.
           camera: a camera of scene.xml.
+          size: width and height of the pictures.
 
         Raises:
           RenderError: if no OpenGL backend works here.
         """
-        header = json.dumps({"config": to_dict(config), "camera": camera})
-        reason = ""
-        for environment in _environments():
+        self._size, reason = size, ""
+        header = json.dumps({"config": to_dict(config), "camera": camera, "size": size})
+        for backend in _backends():
             self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 closed by _end
             pipe = subprocess.PIPE
+            environment = os.environ | {"MUJOCO_GL": backend}
             self._child: Any = subprocess.Popen(
                 CHILD, env=environment, stdin=pipe, stdout=pipe, stderr=self._stderr
             )
-            with contextlib.suppress(
-                BrokenPipeError
-            ):  # the child has died: the read returns nothing
-                self._child.stdin.write(header.encode() + b"\n")
-                self._child.stdin.flush()
-            if self._child.stdout.read(1):
+            if self._ask(header.encode() + b"\n", 1):
                 return
             reason = self._end()
         raise _render_error(reason)
 
     def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """Draws a state.
-
-        Args:
-          qpos: (nq,).
-
-        Returns:
-          (height, width, 3) RGB picture, uint8.
+        """Draws a state (nq,); returns an RGB picture (height, width, 3), uint8.
 
         Raises:
           RenderError: if the child process has died.
         """
-        width, height = VIDEO_SIZE
-        picture = b""
-        with contextlib.suppress(BrokenPipeError):
-            self._child.stdin.write(np.ascontiguousarray(qpos, float).tobytes())
-            self._child.stdin.flush()
-            picture = self._child.stdout.read(height * width * 3)
+        width, height = self._size
+        state = np.ascontiguousarray(qpos, float).tobytes()
+        picture = self._ask(state, height * width * 3)
         if len(picture) < height * width * 3:
             raise _render_error(self._end())
         return np.frombuffer(picture, np.uint8).reshape(height, width, 3).copy()
@@ -131,6 +113,13 @@ class Painter:
         """Ends the process."""
         if not self._stderr.closed:
             self._end()
+
+    def _ask(self, request: bytes, size: int) -> bytes:
+        """Sends bytes, and reads `size` ones; fewer if the child has died."""
+        with contextlib.suppress(BrokenPipeError):
+            self._child.stdin.write(request)
+            self._child.stdin.flush()
+        return self._child.stdout.read(size)
 
     def _end(self) -> str:
         """Ends the process; returns its stderr."""
@@ -216,11 +205,7 @@ def frame_stride(config: Config) -> int:
 
 
 def _check_display() -> None:
-    """Opens and closes a hidden window: without a display, MuJoCo's viewer hangs.
-
-    Raises:
-      RenderError: if there is no display.
-    """
+    """Opens and closes a hidden window: without a display, MuJoCo's viewer hangs."""
     import glfw
 
     with warnings.catch_warnings(record=True) as caught:
@@ -237,45 +222,17 @@ def _check_display() -> None:
 
 
 def _backends() -> tuple[str, ...]:
-    """Backends to try in turn; only the user's choice if there is one."""
+    """Backends to try in turn; only the user's choice if there is one; "" is MuJoCo's own."""
     chosen = os.environ.get("MUJOCO_GL")
     return (chosen,) if chosen else BACKENDS if platform.system() == "Linux" else ("",)
 
 
-def _environments() -> Iterator[dict[str, str]]:
-    """Environment variables of the child process, for each backend."""
-    for backend in _backends():
-        yield os.environ | ({"MUJOCO_GL": backend} if backend else {})
-
-
 def _render_error(stderr: str) -> RenderError:
+    reason = (stderr.strip().splitlines() or ["unknown reason"])[-1]
     return RenderError(
-        f"offscreen rendering with {' or '.join(_backends())} failed ({_last_line(stderr)}); on "
-        "Debian, install libegl1 or libosmesa6"
+        f"offscreen rendering with {' or '.join(_backends())} failed ({reason}); on Debian, "
+        "install libegl1 or libosmesa6"
     )
-
-
-def _last_line(stderr: str) -> str:
-    return (stderr.strip().splitlines() or ["unknown reason"])[-1]
-
-
-@contextlib.contextmanager
-def _draw_fn(
-    header: dict[str, Any], size: tuple[int, int]
-) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
-    """In the child process: a function from states (nq,) to pictures (height, width, 3)."""
-    width, height = size
-    model = build_model(from_dict(Config, header["config"]), visual=True)
-    data = mujoco.MjData(model)
-    with mujoco.Renderer(model, height, width) as renderer:
-
-        def draw(state: np.ndarray) -> np.ndarray:
-            data.qpos[:] = state
-            mujoco.mj_forward(model, data)
-            renderer.update_scene(data, header["camera"])
-            return renderer.render()
-
-        yield draw
 
 
 def _serve() -> None:
@@ -285,38 +242,22 @@ def _serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keeps prints of libraries out of the pipe
     states = sys.stdin.buffer
     header = json.loads(states.readline())
-    with _draw_fn(header, VIDEO_SIZE) as draw:
+    model = build_model(from_dict(Config, header["config"]), visual=True)
+    data = mujoco.MjData(model)
+    width, height = header["size"]
+    with mujoco.Renderer(model, height, width) as renderer:
+        renderer.update_scene(data, header["camera"])
+        renderer.render()  # a broken backend may fail only here
         pictures.write(b"+")
         pictures.flush()
-        size = 8 * build_model(from_dict(Config, header["config"])).nq
+        size = data.qpos.nbytes
         while len(state := states.read(size)) == size:
-            pictures.write(draw(np.frombuffer(state)).tobytes())
+            data.qpos[:] = np.frombuffer(state)
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, header["camera"])
+            pictures.write(renderer.render().tobytes())
             pictures.flush()
 
 
-def _draw(job: Path) -> None:
-    """In the child process: draws the states that `write` saved."""
-    import imageio.v2 as imageio
-
-    with np.load(job) as saved:
-        qpos, header = saved["qpos"], json.loads(str(saved["header"]))
-    path = Path(header["path"])
-    picture = path.suffix == ".png"
-    with _draw_fn(header, PICTURE_SIZE if picture else VIDEO_SIZE) as draw:
-        try:
-            if picture:
-                imageio.imwrite(path, draw(qpos[0]))
-                return
-            with imageio.get_writer(path, fps=header["fps"], quality=8) as writer:
-                for state in qpos:
-                    writer.append_data(draw(state))
-        except OSError as error:  # a full disk, say; OpenGL raises other errors
-            print(error.strerror or error, file=sys.stderr)
-            sys.exit(WRITE_FAILED)
-
-
 if __name__ == "__main__":
-    if sys.argv[1:]:
-        _draw(Path(sys.argv[1]))
-    else:
-        _serve()
+    _serve()

@@ -4,24 +4,33 @@ Actuators, sensors, contacts, keyframes and surroundings of the maker's model ar
 position servos, an IMU and four foot spheres are added.
 """
 
+import functools
 import importlib.util
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
+from mjx_balance.errors import how_to_install
 from mjx_balance.files.text import MESSAGE, quote, shorten
-from mjx_balance.robots.measure import Pose, check_joints, measure
+from mjx_balance.robots.measure import JOINT_ACTUATORS, check_joints, measure, pose
 from mjx_balance.robots.robot import Robot
-from mjx_balance.robots.schema import Foot, RobotError, RobotFile
+from mjx_balance.robots.schema import Foot, LegFile, RobotError, RobotFile
 
+FRESH = mujoco.MjSpec()
+"""MuJoCo's defaults, which its maker's model may have changed."""
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
 IMU = "balance_imu"
 BOARD_SIZE = "board_size"
 """Name of the model's numeric element with `RobotFile.board_size`."""
+REMOVED = (
+    *("keys", "sensors", "excludes", "pairs", "equalities", "tuples", "numerics", "texts"),
+    *("tendons", "skins", "flexes", "lights", "cameras"),
+)
+"""Elements of the maker's model that are removed; what refers to others goes before those."""
 RADIUS_TOLERANCE = 1e-4
 """Greatest difference between the radii of the feet, m."""
 
@@ -76,8 +85,7 @@ def _menagerie(name: str) -> Path:
         import mujoco_menagerie
     except ImportError:
         raise RobotError(
-            f"robot menagerie:{name} needs the package mujoco-menagerie; the extra robots brings "
-            "it: `pip install -e '.[robots]'` in a checkout, or `pip install 'WHEEL[robots]'`"
+            f"robot menagerie:{name} needs the package mujoco-menagerie; {how_to_install('robots')}"
         ) from None
     try:
         robot = mujoco_menagerie.get(name)
@@ -97,7 +105,7 @@ def read_model(path: Path) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise RobotError(f"{path} cannot be read: {mujoco_message(error)}") from error
+        raise RobotError(f"{path} cannot be read: {_mujoco_message(error)}") from error
     spec.compiler.discardvisual = spec.compiler.fusestatic = False  # True by default for URDF
     if path.suffix.lower() == ".urdf":
         for root in spec.worldbody.bodies:
@@ -106,7 +114,15 @@ def read_model(path: Path) -> mujoco.MjSpec:
     return spec
 
 
-def mujoco_message(error: Exception) -> str:
+def compile_model(spec: mujoco.MjSpec, subject: str = "its model") -> mujoco.MjModel:
+    """Compiles a model; raises `RobotError` with MuJoCo's message about `subject`."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise RobotError(f"{subject} cannot be compiled: {_mujoco_message(error)}") from error
+
+
+def _mujoco_message(error: Exception) -> str:
     """MuJoCo's error message in one line; its later lines name the element."""
     lines = (line.strip() for line in str(error).splitlines())
     return shorten("; ".join(line for line in lines if line), MESSAGE)
@@ -139,18 +155,18 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
         raise RobotError(f"trunk {quote(file.trunk)} has no free joint; {_remedy(trunk)}")
     _keep_inertia(spec, trunk)
     _strip(spec, trunk, file)
-    feet = {leg.name: _foot(spec, leg.foot, leg.name) for leg in file.legs}
+    feet = {leg.name: _foot(spec, leg) for leg in file.legs}
     radius = _foot_radius(file, feet)
     spheres = _spheres(spec, feet, radius)
     names = [sphere.name for sphere in spheres]
-    _leave_geoms(spec, trunk, spheres, visual)
+    _leave_geoms(spec, spheres, visual)
     # MuJoCo scales the softness of friction with the weight of the body in contact. A foot on a
     # light body of its own, without a joint, would slide more than one on the calf.
     spec.fuse_static()
-    bare = _compiled(spec)
+    bare = compile_model(spec)
     check_joints(bare, file)
     if _align(spec, trunk, bare, file):
-        bare = _compiled(spec)
+        bare = compile_model(spec)
     robot = measure(file, bare, names, radius)
     _equip(spec, robot, _imu(spec, trunk, bare, file))
     if file.board_size is not None:
@@ -168,13 +184,6 @@ def _remedy(trunk: mujoco.MjsBody) -> str:
     return "it must be free to move; give it a <freejoint/> in its model"
 
 
-def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    try:
-        return spec.compile()
-    except ValueError as error:
-        raise RobotError(f"its model cannot be compiled: {mujoco_message(error)}") from error
-
-
 def _find(elements: list, name: str, what: str, kind: str):
     for element in elements:
         if element.name == name:
@@ -185,72 +194,54 @@ def _find(elements: list, name: str, what: str, kind: str):
 
 def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
     """Removes what the file strips, and everything but the robot's bodies, joints and geoms."""
-    bodies, joints = _strip_elements(spec, trunk, file)
-    gone = {joint.name for body in bodies for joint in _joints_below(body)}
-    gone |= {joint.name for joint in joints}
+    for kind in REMOVED:
+        for element in list(getattr(spec, kind)):
+            spec.delete(element)
+    _strip_elements(spec, trunk, file)
+    for actuator in list(spec.actuators):
+        if actuator.trntype not in JOINT_ACTUATORS or spec.joint(actuator.target) is None:
+            spec.delete(actuator)
+    world = spec.worldbody
+    around = [body for body in world.bodies if body.name != trunk.name]
+    for element in (*around, *world.geoms, *world.sites):
+        spec.delete(element)
+    for size in ("nkey", "nconmax", "njmax", "nuserdata", "memory"):
+        setattr(spec, size, getattr(FRESH, size))
+
+
+def _strip_elements(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
+    """Removes the bodies and joints that the file strips, with all that refers to them."""
+    joints = {joint.name for joint in spec.joints}
+    names = joints | {body.name for body in spec.bodies}
+    for name in file.strip:
+        if name not in names:
+            raise RobotError(
+                f"strip names {quote(name)}, which is no body and no joint of its model"
+            )
+        if name in [joint.name for joint in trunk.joints]:
+            raise RobotError(f"strip names {quote(name)}, by which the trunk is free; it must be")
+        for find in (spec.body, spec.joint):  # a body takes its joints along
+            element = find(name)
+            if element is not None and name != "world":
+                spec.delete(element)
+        if name == "world" or spec.body(file.trunk) is None:
+            raise RobotError(f"strip names {quote(name)}, which is, or carries, the trunk")
+    gone = joints - {joint.name for joint in spec.joints}
     for leg in file.legs:
         for joint in [x for x in leg.joints if x in gone]:
             raise RobotError(
                 f"strip takes joint {quote(joint)} of leg {leg.name}, which the leg needs"
             )
-    usual = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    for actuator in [a for a in spec.actuators if a.trntype not in usual or a.target in gone]:
-        spec.delete(actuator)
-    # Elements that refer to others are deleted before those.
-    refer = [*spec.keys, *spec.sensors, *spec.excludes, *spec.pairs, *spec.equalities]
-    refer += [*spec.tuples, *spec.numerics, *spec.texts, *spec.tendons, *spec.skins, *spec.flexes]
-    for element in (*refer, *joints):
-        spec.delete(element)
-    for body in bodies:
-        spec.delete(body)
-    world = spec.worldbody
-    around = [b for b in world.bodies if b.name != trunk.name]
-    around += [*world.geoms, *world.sites, *spec.lights, *spec.cameras]
-    for element in around:
-        spec.delete(element)
-    fresh = mujoco.MjSpec()
-    for size in ("nkey", "nconmax", "njmax", "nuserdata", "memory"):
-        setattr(spec, size, getattr(fresh, size))
-
-
-def _strip_elements(
-    spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile
-) -> tuple[list[mujoco.MjsBody], list[mujoco.MjsJoint]]:
-    """The outermost bodies that the file strips, and the joints that none of them carries."""
-    carries, body = {"world"}, trunk
-    while body.name != "world":
-        carries.add(body.name)
-        body = body.parent
-    bodies = {b.name: b for b in spec.bodies if b.name in file.strip}
-    joints = {j.name: j for j in spec.joints if j.name in file.strip}
-    for name in file.strip:
-        if name not in bodies and name not in joints:
-            raise RobotError(
-                f"strip names {quote(name)}, which is no body and no joint of its model"
-            )
-        if name in carries:
-            raise RobotError(f"strip names {quote(name)}, which is, or carries, the trunk")
-        if name in [j.name for j in trunk.joints]:
-            raise RobotError(f"strip names {quote(name)}, by which the trunk is free; it must be")
-    below = {x.name for b in bodies.values() for x in b.find_all(mujoco.mjtObj.mjOBJ_BODY)}
-    outer = [b for b in bodies.values() if b.name not in below]
-    gone = {j.name for b in outer for j in _joints_below(b)}
-    return outer, [j for j in joints.values() if j.name not in gone]
-
-
-def _joints_below(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
-    """Joints of a body and of its descendants."""
-    return [j for x in (body, *body.find_all(mujoco.mjtObj.mjOBJ_BODY)) for j in x.joints]
 
 
 class _FootPlace(NamedTuple):
     """Where the model has a foot."""
 
     body: mujoco.MjsBody
-    pos: tuple[float, float, float]
-    """In the body's frame, m; unused with `element`, whose place the compiled model knows."""
-    element: mujoco.MjsGeom | mujoco.MjsSite | None
+    element: mujoco.MjsGeom | mujoco.MjsSite | None = None
     """The geom or site that the file names."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """In the body's frame, m, without an element."""
 
     @property
     def sphere(self) -> mujoco.MjsGeom | None:
@@ -258,29 +249,30 @@ class _FootPlace(NamedTuple):
         return geom if geom and geom.type == mujoco.mjtGeom.mjGEOM_SPHERE else None
 
 
-def _foot(spec: mujoco.MjSpec, foot: str | Foot, leg: str) -> _FootPlace:
-    origin = (0.0, 0.0, 0.0)
+def _foot(spec: mujoco.MjSpec, leg: LegFile) -> _FootPlace:
+    foot = leg.foot
     if isinstance(foot, Foot):
-        body = _find(spec.bodies[1:], foot.body, f"foot of leg {leg}", "bodies")
-        return _FootPlace(body, foot.offset, None)
-    for element in (*spec.geoms, *spec.sites):
-        if element.name == foot:
-            return _FootPlace(element.parent, origin, element)
-    for body in spec.bodies:
-        if body.name == foot:
-            return _FootPlace(body, origin, None)
-    raise RobotError(
-        f"foot of leg {leg} is {quote(foot)}, which is no geom, site or body of its model"
-    )
+        body = _find(spec.bodies[1:], foot.body, f"foot of leg {leg.name}", "bodies")
+        return _FootPlace(body, offset=foot.offset)
+    element = spec.geom(foot) or spec.site(foot)
+    if element is not None:
+        return _FootPlace(element.parent, element)
+    body = spec.body(foot)
+    if body is None:
+        raise RobotError(
+            f"foot of leg {leg.name} is {quote(foot)}, which is no geom, site or body of its model"
+        )
+    return _FootPlace(body)
 
 
 def _foot_radius(file: RobotFile, feet: dict[str, _FootPlace]) -> float:
     if file.foot_radius is not None:
         return file.foot_radius
-    sizes = {name: float(x.sphere.size[0]) for name, x in feet.items() if x.sphere is not None}
-    missing = [name for name in feet if name not in sizes]
-    if missing:
-        raise RobotError(f"foot of leg {missing[0]} is not a sphere geom; say foot_radius, in m")
+    sizes: dict[str, float] = {}
+    for name, foot in feet.items():
+        if foot.sphere is None:
+            raise RobotError(f"foot of leg {name} is not a sphere geom; say foot_radius, in m")
+        sizes[name] = float(foot.sphere.size[0])
     if max(sizes.values()) - min(sizes.values()) > RADIUS_TOLERANCE:
         listed = ", ".join(f"{name} {size:.4g}" for name, size in sizes.items())
         raise RobotError(f"the feet have different radii, {listed}; say foot_radius, in m")
@@ -299,45 +291,51 @@ def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
     changed = compiler.settotalmass > 0 or bounds or compiler.balanceinertia
     asked = [b for b in bodies if by_geoms or changed or not b.explicitinertial]
     if changed or any(geom.mass != 0 for body in asked for geom in body.geoms):
-        model = _compiled(spec)
+        model = compile_model(spec)
         for body in asked:
             if model.body_mass[body.id]:
-                body.mass, body.inertia = model.body_mass[body.id], model.body_inertia[body.id]
-                body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
-                body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
-                body.explicitinertial = True
+                _set_inertia(body, model)
     compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     compiler.settotalmass, compiler.boundmass, compiler.boundinertia = -1, 0, 0
     compiler.balanceinertia = False
+
+
+def _set_inertia(body: mujoco.MjsBody, model: mujoco.MjModel) -> None:
+    """Gives a body the inertia that it has in the compiled model."""
+    compiled = model.body(body.id)
+    body.mass, body.inertia = compiled.mass[0], compiled.inertia
+    body.ipos, body.iquat = compiled.ipos, compiled.iquat
+    body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
+    body.explicitinertial = True
 
 
 def _spheres(
     spec: mujoco.MjSpec, feet: dict[str, _FootPlace], radius: float
 ) -> list[mujoco.MjsGeom]:
     """The sphere of each foot: the model's if its radius fits, else a new one."""
-    own = {
-        name: foot.sphere
-        for name, foot in feet.items()
-        if foot.sphere is not None and abs(foot.sphere.size[0] - radius) < 1e-6
-    }
-    places = {name: foot.pos for name, foot in feet.items()}
-    drawn = {name: x.element for name, x in feet.items() if x.element and name not in own}
-    if drawn:  # only the compiled model knows where these are
-        model = _compiled(spec)
-        for name, element in drawn.items():
-            geom = isinstance(element, mujoco.MjsGeom)
-            places[name] = (model.geom_pos if geom else model.site_pos)[element.id]
+    compiled = functools.cache(lambda: compile_model(spec))  # only it knows where an element is
     spheres = []
     for name, foot in feet.items():
-        sphere = own.get(name)
-        if sphere is None:
-            sphere = foot.body.add_geom(name=_free_name(spec.geoms, f"{name}_contact"))
-            _reset_defaults(sphere, mujoco.MjSpec().worldbody.add_geom())
-            sphere.type = mujoco.mjtGeom.mjGEOM_SPHERE
-            sphere.pos, sphere.size, sphere.mass = places[name], [radius, 0, 0], 0
-            sphere.rgba = [0, 0, 0, 0]
+        sphere = foot.sphere
+        if sphere is None or abs(sphere.size[0] - radius) >= 1e-6:
+            element = foot.element
+            sphere = foot.body.add_geom(
+                FRESH.default,
+                name=_free_name(spec.geoms, f"{name}_contact"),
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[radius, 0, 0],
+                pos=foot.offset if element is None else _place(compiled(), element),
+                mass=0,
+                rgba=[0, 0, 0, 0],
+            )
         spheres.append(sphere)
     return spheres
+
+
+def _place(model: mujoco.MjModel, element: mujoco.MjsGeom | mujoco.MjsSite) -> np.ndarray:
+    """Place of a geom or site in its body's frame, (3,) m."""
+    named = model.geom if isinstance(element, mujoco.MjsGeom) else model.site
+    return named(element.name).pos
 
 
 def _free_name(elements: list, name: str) -> str:
@@ -348,44 +346,21 @@ def _free_name(elements: list, name: str) -> str:
     return name
 
 
-def _reset_defaults(element: Any, fresh: Any) -> None:
-    """Replaces the values that a new element took from the model's default class.
-
-    Args:
-      element: a new geom, site or actuator.
-      fresh: a new one of an empty model, with MuJoCo's defaults.
-    """
-    for field in dir(fresh):
-        value = getattr(fresh, field)
-        ours = field.startswith("_") or field in ("id", "signature", "name")
-        if not ours and (isinstance(value, str) or hasattr(value, "__int__")):
-            setattr(element, field, value)
-    if hasattr(fresh, "alt"):
-        element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-
-
-def _leave_geoms(
-    spec: mujoco.MjSpec, trunk: mujoco.MjsBody, feet: list[mujoco.MjsGeom], visual: bool
-) -> None:
+def _leave_geoms(spec: mujoco.MjSpec, feet: list[mujoco.MjsGeom], visual: bool) -> None:
     """Deletes all geoms but the feet and, with `visual`, those that show the robot.
 
     Without visual geoms in the model, the collision geoms show it. No geom that is left collides by
     itself: contact pairs join the feet and the board.
     """
-    own = {x.name for x in feet}
-    others = [g for g in spec.geoms if g.name not in own]
-    solid = [g for g in others if g.contype or g.conaffinity]
-    looks = [g for g in others if not (g.contype or g.conaffinity)]
-    visible = (looks or solid) if visual else []
-    for geom in (*looks, *solid) if not visual else solid if looks else ():
+    names = {foot.name for foot in feet}
+    others = [geom for geom in spec.geoms if geom.name not in names]
+    solid = [geom for geom in others if geom.contype or geom.conaffinity]
+    hidden = others if not visual else solid if len(solid) < len(others) else []
+    for geom in hidden:
         spec.delete(geom)
-    for geom in (*visible, *feet):
-        geom.contype = geom.conaffinity = 0
-        geom.mass = 0
-    for geom in feet:
-        geom.group = FOOT_GROUP
-    for geom in visible:
-        geom.group = VISUAL_GROUP
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = geom.mass = 0
+        geom.group = FOOT_GROUP if geom.name in names else VISUAL_GROUP
     if not visual:
         for element in (*feet, *spec.sites):
             element.material = ""
@@ -398,27 +373,10 @@ def _align(
 ) -> bool:
     """Moves the trunk to the origin, and turns its contents by quarter turns to make x forward.
 
-    Forward is from the hind hips to the front ones. If the file does not name the ends, it is the
-    longer side of the hips' rectangle, toward positive x or y.
-
     Returns:
       Whether anything was turned.
     """
-    pose = Pose(model, file.trunk, {})
-    hips = {leg.name: pose.anchor(leg.joints[0])[:2] for leg in file.legs}
-    ends = {leg.end for leg in file.legs}
-    if None in ends:
-        if len(ends) > 1:
-            raise RobotError("end is said of some legs only; say it of all, or of none")
-        spread = np.ptp(list(hips.values()), axis=0)
-        forward = np.eye(2)[np.argmax(spread)]
-    else:
-        front = [hips[leg.name] for leg in file.legs if leg.end == "front"]
-        hind = [hips[leg.name] for leg in file.legs if leg.end == "hind"]
-        if len(front) != 2:
-            raise RobotError(f"{len(front)} legs have end front; two must, and two hind")
-        forward = np.mean(front, axis=0) - np.mean(hind, axis=0)
-        _check_ends(file, hips, pose)
+    forward = _forward(file, pose(model, file.trunk))
     quarters = round(math.degrees(math.atan2(forward[1], forward[0])) / 90)
     trunk.pos, trunk.quat = [0, 0, 0], [1, 0, 0, 0]
     trunk.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -426,33 +384,44 @@ def _align(
         return False
     half = -quarters * math.pi / 4
     turn = np.asarray([math.cos(half), 0, 0, math.sin(half)])
-    body = model.body(file.trunk)
+    _set_inertia(trunk, model)
     centre, quat = np.zeros(3), np.zeros(4)
-    mujoco.mju_rotVecQuat(centre, body.ipos, turn)
-    mujoco.mju_mulQuat(quat, turn, body.iquat)
-    trunk.ipos, trunk.iquat, trunk.inertia = centre, quat, body.inertia
-    trunk.mass, trunk.fullinertia = body.mass[0], [np.nan, 0, 0, 0, 0, 0]
-    trunk.explicitinertial = True
-    frames = list(trunk.frames)
-    carried = [*trunk.bodies, *trunk.geoms, *trunk.sites]
+    mujoco.mju_rotVecQuat(centre, trunk.ipos, turn)
+    mujoco.mju_mulQuat(quat, turn, trunk.iquat)
+    trunk.ipos, trunk.iquat = centre, quat
+    contents = [*trunk.frames, *trunk.bodies, *trunk.geoms, *trunk.sites]
     turned = trunk.add_frame(quat=turn)
-    for element in (*frames, *carried):
+    for element in contents:
         if element.frame is None:
             element.set_frame(turned)
     return True
 
 
-def _check_ends(file: RobotFile, hips: dict[str, np.ndarray], pose: Pose) -> None:
-    """Checks that the front legs stand at one end of the trunk, along the abductions' axis."""
-    turns = [np.abs(pose.axis(leg.joints[0])[:2]) for leg in file.legs]
-    along = int(np.argmax(np.sum(turns, axis=0)))
-    middle = np.mean(list(hips.values()), axis=0)[along]
-    front = [leg.name for leg in file.legs if leg.end == "front"]
-    if len({bool(hips[name][along] > middle) for name in front}) == 2:
+def _forward(file: RobotFile, data: mujoco.MjData) -> np.ndarray:
+    """Direction from the hind hips to the front ones, (2,).
+
+    If the file does not name the ends, it is the longer side of the hips' rectangle, toward
+    positive x or y.
+    """
+    abductions = [data.joint(leg.joints[0]) for leg in file.legs]
+    hips = np.asarray([joint.xanchor[:2] for joint in abductions])
+    ends = [leg.end for leg in file.legs]
+    if not any(ends):
+        return np.eye(2)[np.argmax(np.ptp(hips, axis=0))]
+    if None in ends:
+        raise RobotError("end is said of some legs only; say it of all, or of none")
+    if ends.count("front") != 2:
+        raise RobotError(f"{ends.count('front')} legs have end front; two must, and two hind")
+    front = np.asarray(ends) == "front"
+    along = np.argmax(np.sum([np.abs(joint.xaxis[:2]) for joint in abductions], axis=0))
+    ahead = hips[front, along] > hips[:, along].mean()
+    if ahead[0] != ahead[1]:
+        names = " and ".join(leg.name for leg in file.legs if leg.end == "front")
         raise RobotError(
-            f"legs {' and '.join(front)} are said to be front, but they stand at different ends of "
-            "the trunk; correct end of one of them, and of a hind leg"
+            f"legs {names} are said to be front, but they stand at different ends of the trunk; "
+            "correct end of one of them, and of a hind leg"
         )
+    return hips[front].mean(axis=0) - hips[~front].mean(axis=0)
 
 
 def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
@@ -471,11 +440,14 @@ def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
     for leg in robot.legs:
         torques = (robot.hip_torque, robot.hip_torque, robot.knee_torque)
         for name, torque in zip(leg.joints, torques, strict=True):
-            servo = spec.add_actuator(name=name)
-            _reset_defaults(servo, mujoco.MjSpec().add_actuator())
-            servo.target, servo.trntype = name, mujoco.mjtTrn.mjTRN_JOINT
-            servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
-            servo.forcerange = [-torque, torque]
+            servo = spec.add_actuator(
+                FRESH.default,
+                name=name,
+                target=name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+                forcerange=[-torque, torque],
+            )
             servo.set_to_position(kp=robot.servo_stiffness)
     for name, kind in (
         (GYRO, mujoco.mjtSensor.mjSENS_GYRO),
@@ -486,7 +458,7 @@ def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
 
 def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file: RobotFile) -> str:
     """Name of the IMU's site on the trunk, with x forward, y left, z up; adds it if needed."""
-    place = np.asarray(file.imu if isinstance(file.imu, tuple) else (0.0, 0.0, 0.0))
+    place = file.imu if isinstance(file.imu, tuple) else (0.0, 0.0, 0.0)
     if isinstance(file.imu, str):
         _find(spec.sites, file.imu, "imu", "sites")
         site = model.site(file.imu)
@@ -496,7 +468,4 @@ def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file
         if np.allclose(site.quat, (1, 0, 0, 0)):
             return site.name
         place = site.pos
-    new = trunk.add_site(name=_free_name(spec.sites, IMU))
-    _reset_defaults(new, mujoco.MjSpec().worldbody.add_site())
-    new.pos = place
-    return new.name
+    return trunk.add_site(FRESH.default, name=_free_name(spec.sites, IMU), pos=place).name

@@ -8,26 +8,8 @@ import mujoco
 from mjx_balance.files.text import quote
 from mjx_balance.robots.build import build, model_path
 from mjx_balance.robots.draft import draft
-from mjx_balance.robots.robot import Leg, Robot, robot_from_dict
-from mjx_balance.robots.schema import (
-    RobotError,
-    RobotFile,
-    parse_robot_file,
-    read_robot_file,
-)
-
-__all__ = [
-    "SHIPPED",
-    "Leg",
-    "Robot",
-    "RobotError",
-    "find_robot",
-    "robot_file",
-    "robot_from_dict",
-    "robot_spec",
-    "robot_xml",
-    "shipped",
-]
+from mjx_balance.robots.robot import Robot
+from mjx_balance.robots.schema import RobotError, RobotFile, parse_robot_file, read_robot_file
 
 SHIPPED = Path(__file__).resolve().parent
 MENAGERIE = "menagerie:"
@@ -65,15 +47,7 @@ def _draft_file(model: str) -> RobotFile:
 
 
 def robot_spec(name: str, visual: bool = False) -> mujoco.MjSpec:
-    """Returns a new robot body for a scene to attach.
-
-    Args:
-      name: as for `robot_file`.
-      visual: whether to keep the visual geoms.
-
-    Raises:
-      RobotError: as `robot_file` and `build.build`.
-    """
+    """Returns a new robot body for a scene to attach; as `robot_file` and `build.build`."""
     return build(robot_file(name), visual)[0]
 
 
@@ -85,13 +59,9 @@ def robot_xml(name: str) -> str:
 
 
 def find_robot(name: str) -> Robot:
-    """Returns a robot's numbers; cached while its file and model stay the same.
+    """Returns a robot's numbers; as `robot_file` and `build.build`.
 
-    Args:
-      name: as for `robot_file`.
-
-    Raises:
-      RobotError: as `robot_file` and `build.build`.
+    Cached while its file and model stay the same.
     """
     file = robot_file(name)
     return _build_robot(file, model_path(file.model, file.folder).stat().st_mtime_ns)

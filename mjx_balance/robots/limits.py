@@ -15,10 +15,6 @@ def for_robot(config: Config, robot: str) -> Config:
     with its mass; pushes, offsets and the scale of foot heights with its size. Angles, board rate
     and fall limit stay.
 
-    Args:
-      config: for our own robot.
-      robot: as `Config.robot`.
-
     Raises:
       ConfigError: if there is no such robot.
     """
@@ -35,14 +31,9 @@ def for_robot(config: Config, robot: str) -> Config:
 
 def scale_ranges(ranges: RandomizationConfig, robot: Robot) -> RandomizationConfig:
     """Scales payloads with the robot's mass, their offsets and push speeds with its size."""
-    return dataclasses.replace(
-        ranges,
-        payload=ranges.payload * robot.mass_scale,
-        payload_offset=ranges.payload_offset * robot.size_scale,
-        payload_height=ranges.payload_height * robot.size_scale,
-        push_min=ranges.push_min * robot.size_scale,
-        push_max=ranges.push_max * robot.size_scale,
-    )
+    lengths = ("payload_offset", "payload_height", "push_min", "push_max")
+    sizes = {name: getattr(ranges, name) * robot.size_scale for name in lengths}
+    return dataclasses.replace(ranges, payload=ranges.payload * robot.mass_scale, **sizes)
 
 
 def greatest_incline(task: TaskConfig, robot: Robot) -> float:
@@ -61,11 +52,7 @@ def authority(task: TaskConfig, robot: Robot) -> float:
 
 
 def check_robot(config: Config, robot: Robot) -> Config:
-    """Returns `config` if the robot can do what it demands.
-
-    Args:
-      config: from `config.check`.
-      robot: the numbers of `config.robot`.
+    """Returns `config` if the robot can do what it demands; `config.check` comes before.
 
     Raises:
       ConfigError: names the field, its value and the robot.

@@ -2,12 +2,12 @@
 
 import dataclasses
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Le, Len
 
-from mjx_balance.files.validation import STRICT, parse
+from mjx_balance.files.validation import STRICT
 
 MOST = 1e7
 """Bound of a robot's numbers, in their units."""
@@ -97,11 +97,6 @@ class Body:
         return tuple(leg.front for leg in self.legs)
 
     @property
-    def joints(self) -> tuple[tuple[str, str, str], ...]:
-        """Joints of each leg."""
-        return tuple(leg.joints for leg in self.legs)
-
-    @property
     def half_length(self) -> float:
         """Greatest fore-aft distance of a foot from the trunk's origin, m."""
         return max(abs(leg.x) for leg in self.legs)
@@ -158,12 +153,3 @@ class Robot(Body):
     """Standing height of the trunk's origin above the board, foot radius included, m."""
     action_max: Number
     """Greatest height change of one decision on one axis, m."""
-
-
-def robot_from_dict(values: Any) -> Robot:
-    """Builds a robot from the JSON values of `dataclasses.asdict`.
-
-    Raises:
-      InputError: if a field is missing, unknown or of the wrong type.
-    """
-    return parse(Robot, values)

@@ -153,7 +153,7 @@ def parse_robot_file(text: str, path: Path) -> RobotFile:
 
 
 def _with(table: Any, **own: str) -> Any:
-    """A table with fields that its key or the file's path gives; no table: unchanged."""
+    """A table with fields that its key or the file's path gives."""
     if not isinstance(table, dict):
         return table
     for key in own:
@@ -167,10 +167,8 @@ def _check_joints(file: RobotFile) -> None:
     owners: dict[str, str] = {}
     for leg in file.legs:
         for joint in leg.joints:
-            if owners.get(joint) == leg.name:
-                raise RobotError(f"joint {quote(joint)} is in leg {leg.name} twice")
-            if joint in owners:
-                raise RobotError(
-                    f"joint {quote(joint)} is in leg {owners[joint]} and in leg {leg.name}"
-                )
+            owner = owners.get(joint)
+            if owner is not None:
+                rest = "twice" if owner == leg.name else f"and in leg {leg.name}"
+                raise RobotError(f"joint {quote(joint)} is in leg {owner} {rest}")
             owners[joint] = leg.name

@@ -168,7 +168,7 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     robot = find_robot(config.robot)
     check_robot(config, robot)
     model = build_model(config, visual)
-    names = [[f"{ROBOT}{joint}" for joint in leg] for leg in robot.joints]
+    names = [[f"{ROBOT}{joint}" for joint in leg.joints] for leg in robot.legs]
     leg_qpos = np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names])
     leg_ctrl = np.asarray([[model.actuator(n).id for n in leg] for leg in names])
     board = [f"{BOARD}board_{axis}" for axis in "xy"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fixtures import bodies
 
-from mjx_balance.config import ConfigError, check, preset
+from mjx_balance.config import ConfigError, check, from_dict, preset
 from mjx_balance.evaluation.controllers import make_controller, measure_response
 from mjx_balance.evaluation.rollout import run_suite
 from mjx_balance.robots.build import scene_dir
@@ -18,7 +18,6 @@ from mjx_balance.robots.catalogue import (
     Robot,
     RobotError,
     find_robot,
-    robot_from_dict,
     robot_spec,
     robot_xml,
     shipped,
@@ -657,7 +656,7 @@ def test_a_strong_robot_can_be_read_back(tmp_path: Path) -> None:
     name = edited(tmp_path, [], servo_stiffness="10100", knee_torque="20000")
     robot = find_robot(name)
     values = json.loads(json.dumps(dataclasses.asdict(robot)))
-    assert robot_from_dict(values) == robot
+    assert from_dict(Robot, values) == robot
 
 
 def heavy_spec() -> mujoco.MjSpec:
