@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import hashlib
 import json
 import subprocess
 import sys
@@ -29,6 +30,7 @@ from mjx_balance.config import (
     to_dict,
 )
 from mjx_balance.files.run_folder import RunFolderError
+from mjx_balance.training.sizing import size_to_device
 
 SECTIONS = {"task": TaskConfig, "randomization": RandomizationConfig, "dqn": DQNConfig}
 SECTION = {field.name: key for key, kind in SECTIONS.items() for field in dataclasses.fields(kind)}
@@ -83,83 +85,60 @@ def numbers(text: str) -> dict[str, Any]:
     return {name: ast.literal_eval(value) for name, _, value in entries}
 
 
-PAPERS = numbers(  # sections 2 to 4 of the paper
+PAPER = numbers(  # sections 2 to 4 of the paper
     """sim_dt=0.004 ctrl_dt=0.2 body_height=0.35 fail_tilt=6.0 gamma=0.1 max_incline=7.0
     board_rate=3.5 target_period=10.0 square_share=0.0 action_levels=21 action_max=0.003
     num_env_steps=200_000 head='joint' reward_level=0.4 reward_sharpness=1.5 reward_fail=-0.5
-    double=False gyro_lags=[0,1,2,3,4,5] accel_lags=[0,2,4,6,8,10,12,14,15]
-    learning_rate=1e-5 learning_rate_end_share=1.0"""
+    double=False gyro_lags=[0,1,2,3,4,5] accel_lags=[0,2,4,6,8,10,12,14,15] imu_mean=1
+    command_lags=[] reward_tilt='end' learning_rate=1e-5 learning_rate_end_share=1.0"""
 )
 CHOSEN = numbers(  # where the paper is silent; scales of 1 deg and 9.81 sin(1 deg)
     """action_ramp=0.1 height_scale=0.01 episode_length=300 gyro_scale=0.01745329
     accel_scale=0.171208107 replay_capacity=131_072 epsilon_start=1.0 epsilon_end=0.05
     max_grad_norm=10.0 eval_scenarios=128 eval_duration=60.0 num_seeds=1 eval_every=20_000
     export='last' validation_scenarios=4 seed=0 validation_duration=20.0 num_devices=None
-    payload_offset=0.05 payload_height=0.08"""
+    payload_offset=0.05 payload_height=0.08 batch_size=32 replay_ratio=32 num_envs=64
+    target_update_period=1_000 reward_toward=0.4 reward_toward_scale=1.0 hidden_sizes=[256,256]
+    min_replay_size=4_096 epsilon_decay_steps=50_000 mirror=False whiten_steps=0 whiten_floor=1e-3
+    gain_spread=0.0 push_min=0.0 friction_min=None friction_max=None log_every=1_024"""
 )
-OURS = numbers(
-    """square_share=0.5 reward_tilt='mean' target_update_period=200 num_envs=None
-    exploration_noise=2 learning_rate_end_share=0.00333333333 reward_toward=1.0
-    reward_toward_scale=2.5 head='radial' hidden_sizes=[64,64] mirror=True double=False
-    whiten_steps=50_000"""
-)
-PRESET_VALUES = {
-    "paper": PAPERS
-    | CHOSEN
-    | numbers(
-        """imu_mean=1 command_lags=[] reward_tilt='end' batch_size=32 replay_ratio=32
-        target_update_period=1_000 num_envs=64 reward_toward=0.4 reward_toward_scale=1.0
-        hidden_sizes=[256,256] min_replay_size=4_096 epsilon_decay_steps=50_000 mirror=False
-        whiten_steps=0"""
-    ),
-    "default": CHOSEN
-    | OURS
-    | numbers(
-        """gamma=0.1 whiten_floor=1e-3 learning_rate=1e-2 batch_size=256 replay_ratio=32
-        min_replay_size=1_024 epsilon_decay_steps=5_000 num_env_steps=40_000"""
-    ),
-    "best": CHOSEN
-    | OURS
-    | numbers(
-        """gamma=0.4 whiten_floor=0.02 learning_rate=3e-3 batch_size=512 replay_ratio=64
-        min_replay_size=2_048 epsilon_decay_steps=10_000 num_env_steps=200_000 gain_spread=0.0
-        gyro_noise=0.002 accel_noise=0.023 payload=5.0 latency_share=0.15 push_min=0.0
-        push_max=0.4 push_period=2.5 command_lags=[0,1,2] friction_min=None friction_max=None"""
-    ),
-    "smoke": OURS
-    | numbers(
-        """num_envs=64 num_env_steps=8_192 log_every=1_024 eval_scenarios=16 eval_duration=20.0
-        eval_every=4_096 validation_scenarios=2 validation_duration=10.0 whiten_steps=2_048
-        epsilon_decay_steps=4_096"""
-    ),
-}
 
 
-@pytest.mark.parametrize(("name", "values"), PRESET_VALUES.items(), ids=PRESET_VALUES)
-def test_numbers_of_the_presets(name: str, values: dict[str, Any]) -> None:
-    flat = flatten(to_dict(preset(name)))
-    for field, value in values.items():
+def test_preset_paper_has_the_papers_numbers() -> None:
+    flat = flatten(to_dict(preset("paper")))
+    for field, value in (PAPER | CHOSEN).items():
         assert flat[field] == (pytest.approx(value) if isinstance(value, float) else value), field
-
-
-def test_presets_differ_in_no_more_than_they_say() -> None:
-    """A bare config is preset `paper`, but for the number of envs."""
-    paper, default, quick = preset("paper"), preset("default"), preset("quick")
-    assert Config(num_envs=64) == paper
+    assert Config(num_envs=64) == preset("paper")
     assert Config().num_envs is None
-    for config in (paper, default, quick, preset("smoke")):
-        assert config.randomization == RandomizationConfig()
-    assert preset("smoke").task == default.task
-    few_often: dict[str, Any] = {"num_env_steps": 8_192, "eval_every": 0, "replay_ratio": 128.0}
-    own: dict[str, Any] = {"preset": "quick", "epsilon_decay_steps": 3_000}
-    assert quick == changed(default, **few_often, **own)
 
 
-def test_preset_best_sees_every_sample_of_three_decisions_once() -> None:
-    task = preset("best").task
-    for lags in (task.gyro_lags, task.accel_lags):
-        seen = [lag + k for lag in lags for k in range(task.imu_mean)]
-        assert seen == list(range(3 * task.sim_steps))
+@pytest.mark.parametrize(
+    ("name", "digest"),
+    [("default", "e82bd94e"), ("best", "21701f43"), ("quick", "5e04fda4"), ("smoke", "51dacd1d")],
+)
+def test_presets_are_those_that_results_were_measured_with(name: str, digest: str) -> None:
+    """Digests of what differs from the paper: who means to change it, changes it here."""
+    bare, own = (flatten(to_dict(config)) for config in (Config(), preset(name)))
+    changes = {field: value for field, value in own.items() if value != bare[field]}
+    text = json.dumps(changes, sort_keys=True)
+    assert hashlib.sha256(text.encode()).hexdigest()[:8] == digest, changes
+
+
+@pytest.mark.parametrize(
+    ("name", "samples"),
+    [("paper", 32), ("default", 32), ("best", 64), ("quick", 128), ("smoke", 32)],
+)
+@pytest.mark.parametrize("num_envs", [None, 64, 512, 2_048])
+def test_the_replay_ratio_does_not_depend_on_the_number_of_envs(
+    name: str, samples: int, num_envs: int | None
+) -> None:
+    """The paper's is one gradient step of 32 transitions per decision, as in a DQN of one env."""
+    unsized = changed(preset(name), num_envs=num_envs)
+    config = size_to_device(unsized)
+    assert config.num_envs is not None
+    updates = config.dqn.updates_per_step(config.num_envs)
+    assert updates * config.dqn.batch_size == samples * config.num_envs
+    assert config.dqn == unsized.dqn, "nothing that a user set was changed"
 
 
 def test_numbers_that_follow_from_others() -> None:
@@ -259,11 +238,8 @@ def test_no_number_may_be_infinite(name: str, value: float) -> None:
         ({"ctrl_dt": 0.202}, "ctrl_dt is 0.202 s; .* whole multiple of sim_dt, 0.004 s"),
         ({"ctrl_dt": 0.001}, "ctrl_dt is 0.001 s; .* whole multiple of sim_dt, 0.004 s"),
         ({"action_levels": 20}, "action_levels is 20; it must be odd"),
-        ({"accel_lags": ()}, r"accel_lags is \(\); it must have a length of at least 1"),
         ({"gyro_lags": (0, -1)}, r"gyro_lags is \(0, -1\); each entry must be at least 0"),
         ({"gamma": 1.5}, "^gamma is 1.5; it must be at most 1$"),
-        ({"fail_tilt": 90.0}, "^fail_tilt is 90.0; it must be less than 90$"),
-        ({"sim_dt": 0.0}, "^sim_dt is 0.0; it must be greater than 0$"),
         ({"payload_height": 1e300}, "payload_height is 1e.300; it must be less than"),
         ({"reward_tilt": "middle"}, "reward_tilt is 'middle'; it must be one of end, mean"),
         ({"head": "round"}, "head is 'round'; it must be one of joint, factored, radial"),
@@ -353,7 +329,7 @@ def complaint(values: Any) -> str | None:
     return None
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=150)
 @given(name=st.sampled_from(sorted(HINTS)), value=JSON)
 @example(name="gyro_lags", value=3)
 @example(name="hidden_sizes", value=[None])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,7 +12,7 @@ import pytest
 from fixtures import bodies
 
 from mjx_balance.config import check, preset
-from mjx_balance.robots.build import build, model_path, scene_dir
+from mjx_balance.robots.build import build, model_path
 from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, shipped
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.limits import for_robot
@@ -80,71 +79,8 @@ def test_names_do_not_matter(tmp_path: Path, robot: Robot) -> None:
     assert found.foot_radius == 0.022
 
 
-@pytest.mark.parametrize("draw", [lambda spec: spec, bodies.drawn_standing])
-def test_feet_that_are_no_spheres(draw: Any, tmp_path: Path, robot: Robot) -> None:
-    """Legs that end in a capsule: the foot is put at its tip, however the calf is turned."""
-    spec = draw(bodies.our_spec())
-    for leg in bodies.LEGS:
-        for geom in [g for g in spec.geoms if g.name in (f"{leg}_foot", f"{leg}_rubber")]:
-            spec.delete(geom)
-        spec.delete(spec.site(f"{leg}_foot"))
-        spec.body(f"{leg}_calf").add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.01, 0, 0], fromto=[0, 0, -0.1, 0, 0, -0.225]
-        )
-    text, found = drafted(spec, tmp_path)
-    foot = parse_robot_file(text, tmp_path / "drafted.toml").legs[0].foot
-    assert isinstance(foot, Foot)
-    assert foot.body == "LF_calf"
-    assert foot.offset == pytest.approx((0, 0, -0.215), abs=1e-9)
-    assert "foot_radius = 0.02" in text
-    assert found.legs[0].calf == pytest.approx(0.215, abs=1e-6)
-
-
-def test_the_heaviest_free_body_is_the_trunk(tmp_path: Path) -> None:
-    """And not a ball that lies about, though it comes first in the file."""
-    text = (scene_dir() / "quadruped.xml").read_text()
-    inertial = '<inertial pos="0 0 0" mass="0.3" diaginertia="0.001 0.001 0.001"/>'
-    ball = f'<body name="ball"><freejoint/>{inertial}</body>'
-    (tmp_path / "model.xml").write_text(text.replace("<worldbody>", f"<worldbody>{ball}", 1))
-    assert '\ntrunk = "trunk"\n' in draft("model.xml", tmp_path / "model.xml")
-
-
-def test_one_that_looks_along_y(tmp_path: Path, robot: Robot) -> None:
-    text, found = drafted(bodies.turned(bodies.our_spec(), 90), tmp_path)
-    assert "# Looks along its y" in text
-    assert (found.half_length, found.half_track) == pytest.approx((0.193, 0.142))
-    for leg in found.legs:
-        assert (leg.name[1] == "L", leg.name[0] == "F") == (leg.left, leg.front)
-
-
-@pytest.mark.parametrize("root", ["trunk", "base_footprint"])
-def test_a_urdf(root: str, tmp_path: Path, robot: Robot) -> None:
-    """Its root is not said to be free, its feet are shapes on links that nothing moves."""
-    (tmp_path / "model.urdf").write_text(bodies.urdf_text(root))
-    text = draft("model.urdf", tmp_path / "model.urdf")
-    assert f'trunk = "{root}"' in text
-    (tmp_path / "drafted.toml").write_text(text)
-    name = str(tmp_path / "drafted.toml")
-    found = find_robot(name)
-    assert (found.hip_torque, found.knee_torque, found.foot_radius) == (23.7, 45.4, 0.022)
-    assert (found.total_mass, found.trunk_mass) == pytest.approx((15.2, 6.92))
-    for leg, ours in zip(found.legs, robot.legs, strict=True):
-        for field in ("x", "y", "thigh", "calf", "knee", "signs", "zeros"):
-            assert getattr(leg, field) == pytest.approx(getattr(ours, field), abs=1e-9), field
-    load_scene(check(for_robot(preset("default"), name)))
-
-
-def test_a_urdfs_trunk_is_its_root(tmp_path: Path) -> None:
-    (tmp_path / "model.urdf").write_text(bodies.urdf_text("base_footprint"))
-    text = draft("model.urdf", tmp_path / "model.urdf")
-    text = text.replace('trunk = "base_footprint"', 'trunk = "trunk"')
-    with pytest.raises(RobotError, match="it hangs on body 'base_footprint', which has one"):
-        build(parse_robot_file(text, tmp_path / "drafted.toml"))
-
-
-def ornamented() -> mujoco.MjSpec:
-    """A ball at half a calf's length and a mark at the knee; the calf's own end is a capsule's."""
-    spec = bodies.our_spec()
+def stilted(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Legs that end in a capsule; balls at half a calf's length and marks at the knees."""
     for leg in bodies.LEGS:
         for geom in [g for g in spec.geoms if g.name in (f"{leg}_foot", f"{leg}_rubber")]:
             spec.delete(geom)
@@ -158,11 +94,58 @@ def ornamented() -> mujoco.MjSpec:
     return spec
 
 
-def test_ornaments_are_no_feet(tmp_path: Path) -> None:
-    text, _ = drafted(ornamented(), tmp_path)
-    assert 'foot = { body = "LF_calf", offset = [0, 0, -0.215] }' in text
-    assert "ball" not in text
-    assert "mark" not in text
+@pytest.mark.parametrize("draw", [lambda spec: spec, bodies.drawn_standing])
+def test_feet_that_are_no_spheres(draw: Any, tmp_path: Path) -> None:
+    """The foot is at the capsule's tip, however the calf is turned; ornaments are no feet."""
+    text, robot = drafted(stilted(draw(bodies.our_spec())), tmp_path)
+    foot = parse_robot_file(text, tmp_path / "drafted.toml").legs[0].foot
+    assert foot == Foot("LF_calf", pytest.approx((0, 0, -0.215), abs=1e-9))  # pyright: ignore
+    assert "foot_radius = 0.02\n" in text
+    assert robot.legs[0].calf == pytest.approx(0.215, abs=1e-6)
+
+
+def test_the_heaviest_free_body_is_the_trunk(tmp_path: Path) -> None:
+    """And not a ball that lies about, though it comes first in the file."""
+    inertial = '<inertial pos="0 0 0" mass="0.3" diaginertia="0.001 0.001 0.001"/>'
+    ball = f'<body name="ball"><freejoint/>{inertial}</body>'
+    bodies.write_robot(tmp_path, [("<worldbody>", f"<worldbody>{ball}")])
+    assert '\ntrunk = "trunk"\n' in draft("model.xml", tmp_path / "model.xml")
+
+
+def test_one_that_looks_along_y(tmp_path: Path) -> None:
+    text, other = drafted(bodies.turned(bodies.our_spec(), 90), tmp_path)
+    assert "# Looks along its y" in text
+    assert (other.half_length, other.half_track) == pytest.approx((0.193, 0.142))
+    check_corners(other)
+
+
+def check_corners(robot: Robot) -> None:
+    for leg in robot.legs:
+        assert (leg.name[1] == "L", leg.name[0] == "F") == (leg.left, leg.front)
+
+
+@pytest.mark.parametrize("root", ["trunk", "base_footprint"])
+def test_a_urdf(root: str, tmp_path: Path, robot: Robot) -> None:
+    """Its root is not said to be free, its feet are shapes on links that nothing moves."""
+    (tmp_path / "model.urdf").write_text(bodies.urdf_text(root))
+    text = draft("model.urdf", tmp_path / "model.urdf")
+    assert f'trunk = "{root}"' in text
+    (tmp_path / "drafted.toml").write_text(text)
+    found = find_robot(str(tmp_path / "drafted.toml"))
+    assert (found.hip_torque, found.knee_torque, found.foot_radius) == (23.7, 45.4, 0.022)
+    assert (found.total_mass, found.trunk_mass) == pytest.approx((15.2, 6.92))
+    for leg, ours in zip(found.legs, robot.legs, strict=True):
+        for field in ("x", "y", "thigh", "calf", "knee", "signs", "zeros"):
+            assert getattr(leg, field) == pytest.approx(getattr(ours, field), abs=1e-9), field
+    load_scene(check(for_robot(preset("default"), str(tmp_path / "drafted.toml"))))
+
+
+def test_a_urdfs_trunk_is_its_root(tmp_path: Path) -> None:
+    (tmp_path / "model.urdf").write_text(bodies.urdf_text("base_footprint"))
+    text = draft("model.urdf", tmp_path / "model.urdf")
+    text = text.replace('trunk = "base_footprint"', 'trunk = "trunk"')
+    with pytest.raises(RobotError, match="it hangs on body 'base_footprint', which has one"):
+        build(parse_robot_file(text, tmp_path / "drafted.toml"))
 
 
 def test_feet_of_different_sizes(tmp_path: Path) -> None:
@@ -185,56 +168,49 @@ def test_a_trunk_whose_origin_is_behind_all_legs(tmp_path: Path) -> None:
     places = [(leg.name, leg.joints[0]) for leg in found.legs]
     pairs = (("FL", "LF"), ("FR", "RF"), ("RL", "LH"), ("RR", "RH"))
     assert places == [(corner, f"{leg}_abduction") for corner, leg in pairs]
-    for leg in found.legs:
-        assert (leg.name[1] == "L", leg.name[0] == "F") == (leg.left, leg.front)
+    check_corners(found)
 
 
 def test_names_that_toml_must_quote(tmp_path: Path) -> None:
-    spec = bodies.our_spec()
-    for servo in [*spec.actuators]:
-        spec.delete(servo)
+    spec = without_servos()
     spec.joint("LF_hip").name = 'the "left" \\ hip'
-    _, found = drafted(spec, tmp_path)
-    assert found.legs[0].joints[1] == 'the "left" \\ hip'
+    _, robot = drafted(spec, tmp_path)
+    assert robot.legs[0].joints[1] == 'the "left" \\ hip'
 
 
-def nameless(kind: str) -> mujoco.MjSpec:
+def without_servos() -> mujoco.MjSpec:
     spec = bodies.our_spec()
     for servo in [*spec.actuators]:
         spec.delete(servo)
-    getattr(spec, kind)("trunk" if kind == "body" else "LF_hip").name = ""
-    return spec
-
-
-def crowded() -> mujoco.MjSpec:
-    spec = bodies.our_spec()
-    spec.body("LH_hip").pos = [0.15, 0.0465, 0]
     return spec
 
 
 @pytest.mark.parametrize(
-    ("spec", "message"),
+    ("change", "message"),
     [
-        (lambda: nameless("joint"), "a joint of body 'LF_thigh' has no name; give it one in its"),
-        (lambda: nameless("body"), "the body of the free joint, the trunk, has no name"),
-        (crowded, r'of joints \["LF_abduction", "LH_abduction"\] both stand front left'),
+        (
+            lambda spec: setattr(spec.joint("LF_hip"), "name", ""),
+            "a joint of body 'LF_thigh' has no name; give it one in its",
+        ),
+        (
+            lambda spec: setattr(spec.body("trunk"), "name", ""),
+            "the body of the free joint, the trunk, has no name",
+        ),
+        (
+            lambda spec: setattr(spec.body("LH_hip"), "pos", [0.15, 0.0465, 0]),
+            r'of joints \["LF_abduction", "LH_abduction"\] both stand front left',
+        ),
+        (
+            lambda spec: spec.delete(spec.body("LF_hip")),
+            "has 3 chains of three hinges .*RF_abduction",
+        ),
+        (lambda spec: spec.delete(spec.joint("root")), "has no free joint"),
     ],
 )
-def test_what_cannot_be_drafted_is_said(
-    spec: Callable[[], mujoco.MjSpec], message: str, tmp_path: Path
-) -> None:
+def test_what_cannot_be_drafted_is_refused(change: Any, message: str, tmp_path: Path) -> None:
+    spec = without_servos()
+    change(spec)
     with pytest.raises(RobotError, match=message):
-        drafted(spec(), tmp_path)
-
-
-def test_what_is_no_quadruped_is_refused(tmp_path: Path) -> None:
-    spec = bodies.our_spec()
-    spec.delete(spec.body("LF_hip"))
-    with pytest.raises(RobotError, match=r"has 3 chains of three hinges .*RF_abduction"):
-        drafted(spec, tmp_path)
-    spec = bodies.our_spec()
-    spec.delete(spec.joint("root"))
-    with pytest.raises(RobotError, match="has no free joint"):
         drafted(spec, tmp_path)
 
 

@@ -30,6 +30,7 @@ foot = { body = "b", offset = [0, 0, -0.2] }
 [legs.C]
 joints = ["c0", "c1", "c2"]
 foot = "c"
+knee = "forward"
 
 [legs.D]
 joints = ["d0", "d1", "d2"]
@@ -50,6 +51,7 @@ def test_everything_is_read(tmp_path: Path) -> None:
     assert got.legs[0] == LegFile("A", ("a0", "a1", "a2"), "a", "left", "hind")
     assert got.legs[1] == LegFile("B", ("b0", "b1", "b2"), Foot("b", (0.0, 0.0, -0.2)))
     assert [leg.name for leg in got.legs] == ["A", "B", "C", "D"], "in the file's order"
+    assert [leg.knee for leg in got.legs] == [None, None, "forward", None]
 
 
 @pytest.mark.parametrize(
@@ -112,11 +114,6 @@ def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, message: str
     with pytest.raises(RobotError, match=message) as caught:
         read(tmp_path, TEXT.replace(old, new, 1))
     assert str(tmp_path / "rex.toml") in str(caught.value)
-
-
-def test_which_way_a_knee_points_is_read(tmp_path: Path) -> None:
-    got = read(tmp_path, TEXT.replace('end = "hind"', 'knee = "forward"'))
-    assert [leg.knee for leg in got.legs] == ["forward", None, None, None]
 
 
 def test_no_file_and_no_text(tmp_path: Path) -> None:
