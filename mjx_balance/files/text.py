@@ -17,9 +17,9 @@ def shorten(text: object, limit: int = 80) -> str:
     return f"{line[: limit - 3]}..." if cut else line
 
 
-def quote(value: object, limit: int = 80) -> str:
+def quote(value: object) -> str:
     """Returns a value's `repr`, shortened."""
     try:
-        return shorten(repr(value), limit)
+        return shorten(repr(value))
     except ValueError:  # an int with too many digits
         return "a number of thousands of digits"

@@ -57,14 +57,10 @@ def _adapter(kind: Any) -> Any:
 
 
 def check_types(value: T, error: type[InputError] = InputError) -> T:
-    """Returns `value` if its fields have the types and bounds that its dataclass declares.
-
-    Args:
-      value: instance of a dataclass.
-      error: class to raise.
+    """Returns a dataclass if its fields have the types and bounds that its class declares.
 
     Raises:
-      InputError: names the first invalid field, its value and what would be right.
+      InputError: of class `error`; names the first invalid field, its value and a remedy.
     """
     try:
         _adapter(type(value)).validate_python(value)
@@ -87,17 +83,15 @@ def parse(
       values: from `json.loads` or `tomllib.loads`.
       error: class to raise.
       remedies: {field: end of "it must ..."}, where it differs from `REMEDIES`.
-      name: name of the value in messages; "": the type's.
+      name: of the value in messages; "": the type's.
 
     Raises:
       InputError: as `check_types`.
     """
     try:
         return _adapter(kind).validate_json(json.dumps(values, default=str), strict=True)
-    except (TypeError, RecursionError) as broken:
-        raise error(f"{quote(values)} cannot be written as JSON") from broken
-    except ValueError as broken:
-        if not hasattr(broken, "errors"):  # an int of too many digits
+    except (TypeError, RecursionError, ValueError) as broken:
+        if not hasattr(broken, "errors"):  # json's own, as for an int of too many digits
             raise error(f"{quote(values)} cannot be written as JSON") from broken
         raise error(_sentence(broken, kind, values, remedies, name)) from broken
 

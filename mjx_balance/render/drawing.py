@@ -24,12 +24,14 @@ import numpy as np
 
 from mjx_balance.config import Config, from_dict, to_dict
 from mjx_balance.files.run_folder import write_atomically
+from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.sim.scene import build_model
 
 FPS = 25
 VIDEO_SIZE = (960, 544)
 PICTURE_SIZE = (1280, 720)
 BACKENDS = ("egl", "osmesa")
+CAMERA = "main"
 CHILD = (sys.executable, "-m", "mjx_balance.render.drawing")
 
 
@@ -37,14 +39,13 @@ class RenderError(RuntimeError):
     """This machine cannot draw pictures or open a window; the message says why."""
 
 
-def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") -> None:
+def write(path: Path, config: Config, qpos: np.ndarray) -> None:
     """Draws the first state to a `.png` file, or all states to a video, atomically.
 
     Args:
       path: file to write; any suffix but `.png` makes a video, at real speed.
       config: defines the scene and the time step.
       qpos: (steps, nq), one state per physics step.
-      camera: a camera of scene.xml.
 
     Raises:
       RenderError: if no OpenGL backend works here, or the file cannot be written.
@@ -52,10 +53,10 @@ def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") ->
     import imageio.v2 as imageio
 
     is_picture, stride = path.suffix == ".png", frame_stride(config)
-    painter = Painter(config, camera, PICTURE_SIZE if is_picture else VIDEO_SIZE)
-    with contextlib.closing(painter), tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"drawn{path.suffix}"
-        try:
+    painter = Painter(config, PICTURE_SIZE if is_picture else VIDEO_SIZE)
+    try:
+        with contextlib.closing(painter), tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / f"drawn{path.suffix}"
             if is_picture:
                 imageio.imwrite(file, painter.draw(qpos[0]))
             else:
@@ -64,26 +65,26 @@ def write(path: Path, config: Config, qpos: np.ndarray, camera: str = "main") ->
                     for state in qpos[::stride]:
                         writer.append_data(painter.draw(state))
             write_atomically(path, file.read_bytes())
-        except OSError as error:
-            raise RenderError(f"{path} cannot be written: {error.strerror or error}") from error
+    except OSError as error:
+        reason = error.strerror or shorten(error, MESSAGE)
+        raise RenderError(f"{path} cannot be written: {reason}") from error
 
 
 class Painter:
     """Draws states one by one in a child process, which runs until `close`."""
 
-    def __init__(self, config: Config, camera: str = "main", size: tuple[int, int] = VIDEO_SIZE):
+    def __init__(self, config: Config, size: tuple[int, int] = VIDEO_SIZE):
         """Starts the process.
 
         Args:
           config: defines the scene.
-          camera: a camera of scene.xml.
           size: width and height of the pictures.
 
         Raises:
           RenderError: if no OpenGL backend works here.
         """
         self._size, reason = size, ""
-        header = json.dumps({"config": to_dict(config), "camera": camera, "size": size})
+        header = json.dumps({"config": to_dict(config), "size": size})
         for backend in _backends():
             self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 closed by _end
             pipe = subprocess.PIPE
@@ -165,7 +166,7 @@ class Window:
                 f"no window can be opened here ({error}); start it by mjpython, as `mjpython -m "
                 "mjx_balance view best`"
             ) from error
-        self._viewer.cam.fixedcamid = self._model.camera("main").id
+        self._viewer.cam.fixedcamid = self._model.camera(CAMERA).id
         self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._next = time.monotonic()
 
@@ -246,7 +247,7 @@ def _serve() -> None:
     data = mujoco.MjData(model)
     width, height = header["size"]
     with mujoco.Renderer(model, height, width) as renderer:
-        renderer.update_scene(data, header["camera"])
+        renderer.update_scene(data, CAMERA)
         renderer.render()  # a broken backend may fail only here
         pictures.write(b"+")
         pictures.flush()
@@ -254,7 +255,7 @@ def _serve() -> None:
         while len(state := states.read(size)) == size:
             data.qpos[:] = np.frombuffer(state)
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, header["camera"])
+            renderer.update_scene(data, CAMERA)
             pictures.write(renderer.render().tobytes())
             pictures.flush()
 

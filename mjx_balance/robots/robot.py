@@ -82,11 +82,6 @@ class Body:
     """kg"""
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the legs."""
-        return tuple(leg.name for leg in self.legs)
-
-    @property
     def left(self) -> tuple[bool, ...]:
         """Whether each leg is on the left side."""
         return tuple(leg.left for leg in self.legs)

@@ -12,7 +12,6 @@ import jax
 from mjx_balance.config import (
     Config,
     ConfigError,
-    check,
     check_same_config,
     expand_runs,
     flatten,
@@ -111,7 +110,7 @@ def _set_up(config: Config) -> Setup:
     """Sizes a run to the devices; envs that nobody asked for are halved until they fit."""
     most = None
     while True:
-        sized = sizing.size_to_device(check(config), most)
+        sized = sizing.size_to_device(config, most)
         finish.check_fits(sized)
         env = BalanceEnv(sized)
         learner = sizing.make_learner(sized, env)

@@ -82,10 +82,11 @@ def size_to_device(config: Config, most: int | None = None) -> Config:
       most: envs to choose, for want of memory.
 
     Raises:
-      ConfigError: if the engine does not run on it, or the envs cannot be spread over its devices.
+      ConfigError: if the config is invalid, its engine does not run here, or the envs cannot be
+        spread over the devices.
     """
     device = jax.devices()[0]
-    check_platform(config.engine, device.platform, device.device_kind)
+    check_platform(check(config).engine, device.platform, device.device_kind)
     if config.num_envs is None:
         config = scale_sizes(config, _default_envs(config.engine, most))
     assert config.num_envs is not None

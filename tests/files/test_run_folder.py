@@ -267,13 +267,13 @@ def test_a_damaged_file_gives_a_sentence(
     folder.provenance.write_bytes(content)
     with pytest.raises(RunFolderError, match=r"provenance.json cannot be used: "):
         check_same_provenance(folder.path, TODAY)
-    says = "fine"
+    message = "fine"
     try:
         assert isinstance(read_run_config(folder.path), Config)
     except RunFolderError as error:
-        says = str(error)
-    assert says.isprintable()
-    assert len(says) < 500 + len(str(folder.path))
+        message = str(error)
+    assert message.isprintable()
+    assert len(message) < 500 + len(str(folder.path))
 
 
 def test_a_config_of_many_megabytes_is_not_read(folder: RunFolder) -> None:

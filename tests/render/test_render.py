@@ -105,10 +105,10 @@ def test_a_file_that_cannot_be_written_is_no_matter_of_opengl(
 
 
 def test_macos_wants_mjpython(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = "`launch_passive` requires that the Python script be run under `mjpython` on macOS"
+    reason = "`launch_passive` requires that the Python script be run under `mjpython` on macOS"
 
     def launch(*arguments: object, **looks: object) -> None:
-        raise RuntimeError(said)
+        raise RuntimeError(reason)
 
     monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
     monkeypatch.setattr("mjx_balance.render.drawing._check_display", lambda: None)

@@ -66,7 +66,7 @@ def check_kinematics(scene: Scene) -> None:
     limited = model.jnt_limited[joints].astype(bool)
     for height in np.linspace(*robot.height_range, 7):
         angles = joint_angles(robot, np.full(4, height))
-        assert ((angles >= low - 1e-3) & (angles <= high + 1e-3) | ~limited).all()
+        assert ((angles >= low - 1e-6) & (angles <= high + 1e-6) | ~limited).all()
         feet = feet_of(scene, angles)
         np.testing.assert_allclose(-feet[:, 2] + robot.foot_radius, height, atol=1e-6)
         np.testing.assert_allclose(feet[:, 0], robot.each("x"), atol=1e-6)
@@ -88,7 +88,8 @@ def feet_of(scene: Scene, angles: np.ndarray) -> np.ndarray:
 def test_our_robot_is_the_same_however_it_is_drawn(drawing: str, robot: Robot) -> None:
     """Up to order, signs and zeros; gains and heights follow by the rules."""
     other = find_robot(drawing)
-    order = [other.names.index(name) for name in robot.names]
+    names = [leg.name for leg in other.legs]
+    order = [names.index(leg.name) for leg in robot.legs]
     for k, leg in zip(order, robot.legs, strict=True):
         assert (other.legs[k].joints, other.legs[k].foot) == (leg.joints, leg.foot)
     for name in "left front x y axis_height drop offset thigh calf knee".split():

@@ -68,15 +68,15 @@ def anonymous() -> mujoco.MjSpec:
 
 
 def test_names_do_not_matter(tmp_path: Path, robot: Robot) -> None:
-    text, found = drafted(anonymous(), tmp_path)
+    text, other = drafted(anonymous(), tmp_path)
     assert 'strip = ["arm0_joint", "arm1_joint", "arm2_joint"]' in text
-    assert found.names == ("FL", "FR", "RL", "RR")
-    assert found.total_mass == pytest.approx(robot.total_mass + 0.6)
-    for leg, ours in zip(found.legs, robot.legs, strict=True):
+    assert [leg.name for leg in other.legs] == ["FL", "FR", "RL", "RR"]
+    assert other.total_mass == pytest.approx(robot.total_mass + 0.6)
+    for leg, ours in zip(other.legs, robot.legs, strict=True):
         assert (leg.x, leg.y, leg.thigh, leg.calf) == pytest.approx(
             (ours.x, ours.y, ours.thigh, ours.calf), abs=1e-6
         )
-    assert found.foot_radius == 0.022
+    assert other.foot_radius == 0.022
 
 
 def stilted(spec: mujoco.MjSpec) -> mujoco.MjSpec:
@@ -131,10 +131,10 @@ def test_a_urdf(root: str, tmp_path: Path, robot: Robot) -> None:
     text = draft("model.urdf", tmp_path / "model.urdf")
     assert f'trunk = "{root}"' in text
     (tmp_path / "drafted.toml").write_text(text)
-    found = find_robot(str(tmp_path / "drafted.toml"))
-    assert (found.hip_torque, found.knee_torque, found.foot_radius) == (23.7, 45.4, 0.022)
-    assert (found.total_mass, found.trunk_mass) == pytest.approx((15.2, 6.92))
-    for leg, ours in zip(found.legs, robot.legs, strict=True):
+    other = find_robot(str(tmp_path / "drafted.toml"))
+    assert (other.hip_torque, other.knee_torque, other.foot_radius) == (23.7, 45.4, 0.022)
+    assert (other.total_mass, other.trunk_mass) == pytest.approx((15.2, 6.92))
+    for leg, ours in zip(other.legs, robot.legs, strict=True):
         for field in ("x", "y", "thigh", "calf", "knee", "signs", "zeros"):
             assert getattr(leg, field) == pytest.approx(getattr(ours, field), abs=1e-9), field
     load_scene(check(for_robot(preset("default"), str(tmp_path / "drafted.toml"))))
@@ -154,9 +154,9 @@ def test_feet_of_different_sizes(tmp_path: Path) -> None:
     for geom in [g for g in spec.geoms if g.name.endswith("_rubber")]:
         spec.delete(geom)
     spec.geom("LH_foot").size = [0.025, 0, 0]
-    text, found = drafted(spec, tmp_path)
+    text, other = drafted(spec, tmp_path)
     assert "foot_radius = 0.025\n" in text
-    assert found.foot_radius == 0.025
+    assert other.foot_radius == 0.025
 
 
 def test_a_trunk_whose_origin_is_behind_all_legs(tmp_path: Path) -> None:
@@ -164,11 +164,11 @@ def test_a_trunk_whose_origin_is_behind_all_legs(tmp_path: Path) -> None:
     for leg in bodies.LEGS:
         hip = spec.body(f"{leg}_hip")
         hip.pos = hip.pos + np.asarray([0.25, 0.2, 0])
-    _, found = drafted(spec, tmp_path)
-    places = [(leg.name, leg.joints[0]) for leg in found.legs]
+    _, other = drafted(spec, tmp_path)
+    places = [(leg.name, leg.joints[0]) for leg in other.legs]
     pairs = (("FL", "LF"), ("FR", "RF"), ("RL", "LH"), ("RR", "RH"))
     assert places == [(corner, f"{leg}_abduction") for corner, leg in pairs]
-    check_corners(found)
+    check_corners(other)
 
 
 def test_names_that_toml_must_quote(tmp_path: Path) -> None:
@@ -222,10 +222,10 @@ def test_menagerie_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robo
     spec.compile()
     (folder / "go1.xml").write_text(spec.to_xml())
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
-    found = find_robot("menagerie:unitree_go1")
-    assert found.name == "menagerie:unitree_go1"
+    other = find_robot("menagerie:unitree_go1")
+    assert other.name == "menagerie:unitree_go1"
     legs = [
-        dataclasses.replace(leg, name=x.name) for leg, x in zip(found.legs, robot.legs, strict=True)
+        dataclasses.replace(leg, name=x.name) for leg, x in zip(other.legs, robot.legs, strict=True)
     ]
     assert tuple(legs) == robot.legs
     with pytest.raises(RobotError, match=r"menagerie:unitree_go2 cannot be had: .*MENAGERIE_ROOT"):

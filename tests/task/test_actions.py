@@ -132,7 +132,7 @@ def test_a_batch_of_feet_moves_foot_by_foot(robot: Robot) -> None:
     for where in np.ndindex(2, 3):
         a_x, a_y = change[where]
         moves = {"LF": a_x + a_y, "RF": -a_x + a_y, "LH": a_x - a_y, "RH": -a_x - a_y}
-        expected = [heights[where][k] + moves[leg] for k, leg in enumerate(robot.names)]
+        expected = [heights[where][k] + moves[leg.name] for k, leg in enumerate(robot.legs)]
         np.testing.assert_allclose(got[where], expected, atol=1e-12)
 
 
