@@ -17,29 +17,25 @@ def code(module: str, package: Path = PACKAGE) -> dict[str, str]:
       {module: code}, without comments and docstrings.
     """
     modules: dict[str, str] = {}
-    _collect(package, module, modules)
+    names = [module]
+    while names:
+        name = names.pop()
+        root, *parts = name.split(".")
+        if root != PACKAGE.name or not parts or name in modules:
+            continue
+        inside = package.joinpath(*parts)
+        file = inside / "__init__.py" if inside.is_dir() else inside.with_suffix(".py")
+        if not file.is_file():  # `name` is a name inside a module
+            continue
+        tree = _DropDocstrings().visit(ast.parse(file.read_text(encoding="utf-8")))
+        modules[name] = ast.unparse(tree)
+        names.append(name.rpartition(".")[0])
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                names += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names += [str(node.module), *(f"{node.module}.{x.name}" for x in node.names)]
     return modules
-
-
-def _collect(package: Path, name: str, modules: dict[str, str]) -> None:
-    root, *parts = name.split(".")
-    if root != PACKAGE.name or not parts or name in modules:
-        return
-    inside = package.joinpath(*parts)
-    file = inside / "__init__.py" if inside.is_dir() else inside.with_suffix(".py")
-    if not file.is_file():  # `name` is a name inside a module
-        return
-    tree = _DropDocstrings().visit(ast.parse(file.read_text(encoding="utf-8")))
-    modules[name] = ast.unparse(tree)
-    targets = [name.rpartition(".")[0]]
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            targets += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            targets += [f"{node.module}.{alias.name}" for alias in node.names]
-            targets.append(str(node.module))
-    for target in targets:
-        _collect(package, target, modules)
 
 
 class _DropDocstrings(ast.NodeTransformer):

@@ -271,7 +271,7 @@ def test_a_file_may_name_the_boards_size(tmp_path: Path) -> None:
 
 
 def test_a_files_own_numbers_win(tmp_path: Path) -> None:
-    numbers = {
+    numbers: dict[str, Any] = {
         "servo_stiffness": "300.0",
         "servo_damping": "11.0",
         "servo_armature": "0.03",
@@ -359,7 +359,7 @@ LEFTOVERS = {
 @pytest.mark.parametrize("left", LEFTOVERS)
 def test_nothing_of_the_makers_is_left(tmp_path: Path, left: str) -> None:
     """The scene is that of a model without it."""
-    extra = {"foot_radius": "0.03", "hip_torque": "20", "knee_torque": "40"}
+    extra: dict[str, Any] = {"foot_radius": "0.03", "hip_torque": "20", "knee_torque": "40"}
     scene = scene_of(bodies.write_robot(tmp_path / "left", [LEFTOVERS[left]], **extra))
     plain = scene_of(bodies.write_robot(tmp_path / "plain", **extra))
     assert scene.hash == plain.hash
@@ -708,7 +708,7 @@ STRONG = {"knee_torque": "500", "hip_torque": "500"}
     ],
 )
 def test_why_it_does_not_stand(
-    edits: Edits, extra: dict[str, str], message: str, tmp_path: Path
+    edits: Edits, extra: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     """With the trunk's 6.92 of 15.2 kg half a metre ahead; feet need 2 * 0.193 m of board."""
     name = bodies.write_robot(tmp_path, edits, **extra)
