@@ -45,8 +45,6 @@ from mjx_balance.policy.heads import Head
 
 Params: TypeAlias = Any
 """A network's variables, a flax pytree."""
-Reset: TypeAlias = Callable[[jax.Array], State]
-"""PRNG key -> a fresh env."""
 Means: TypeAlias = dict[str, Mean]
 
 
@@ -72,19 +70,17 @@ class DQNSpec:
     symmetries: Symmetries | None = None
     """Reflections of the env, for `config.mirror`."""
     action_factors: tuple[int, ...] | None = None
-    """Number of levels of each digit of an action index, for the exploration noise; None: one
-    digit."""
-    first_reset: Reset | None = None
-    """Reset at the start of a run; None: `Env.reset`."""
+    """Levels of each digit of an action index, for the exploration noise; None: one digit."""
+    first_reset: Callable[[jax.Array], State] | None = None
+    """PRNG key -> an env at the start of a run; None: `Env.reset`."""
     sweep: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
     """Field of `config` -> its value in every run."""
 
     def __post_init__(self) -> None:
-        num_devices = len(self.devices)
         for name, value in (("num_envs", self.num_envs), ("batch_size", self.config.batch_size)):
-            if value % num_devices:
+            if value % len(self.devices):
                 raise ValueError(
-                    f"{name} is {value}; it must be a multiple of the {num_devices} devices"
+                    f"{name} is {value}; it must be a multiple of the {len(self.devices)} devices"
                 )
         if self.config.mirror and self.symmetries is None:
             raise ValueError("mirror is True, but no symmetries are given to mirror with")
@@ -177,11 +173,8 @@ class DQN:
         return self._init_program(seeds if self.spec.num_seeds > 1 else seeds[0], sweep)
 
     @cached_property
-    def _init_program(self) -> Callable[[np.ndarray, Mapping[str, np.ndarray]], TrainState]:
-        def init(seed: jax.Array, sweep: dict[str, jax.Array]) -> TrainState:
-            return self.initial_state(jax.random.PRNGKey(seed), sweep)
-
-        init = self._each_seed(init)
+    def _init_program(self) -> Callable[..., TrainState]:
+        init = self._each_seed(lambda seed, x: self.initial_state(jax.random.PRNGKey(seed), x))
         return jax.jit(on_each_device(init, self.mesh, REPLICATED, self.state_specs))
 
     def train_program(
@@ -211,9 +204,8 @@ class DQN:
             return state, {name: mean.value() for name, mean in totals.items()}
 
         specs = self.state_specs
-        return jax.jit(
-            on_each_device(program, self.mesh, (specs,), (specs, REPLICATED)), donate_argnums=0
-        )
+        sharded = on_each_device(program, self.mesh, (specs,), (specs, REPLICATED))
+        return jax.jit(sharded, donate_argnums=0)
 
     def export_params(self, state: TrainState) -> Params:
         """Returns the parameters of one run (no seed axis) for raw observations."""
@@ -225,13 +217,20 @@ class DQN:
     # The methods below handle one run, on each device.
 
     def initial_state(self, key: PRNGKeyArray, sweep: dict[str, jax.Array]) -> TrainState:
-        """The state of a new run."""
+        """The state of a new run.
+
+        Raises:
+          TypeError: if the env observes a dictionary, as brax allows.
+        """
         spec, config = self.spec, self.spec.config
         key, key_params, key_env = jax.random.split(key, 3)
         local_envs = spec.per_device(spec.num_envs)
         reset = spec.first_reset or self.env.reset
         env_state = reset_all(reset, device_key(key_env), local_envs)
-        obs = as_array(env_state.obs)[0]
+        if not isinstance(env_state.obs, jax.Array):
+            kind = type(env_state.obs).__name__
+            raise TypeError(f"the env observes {kind}; this DQN takes arrays")
+        obs = env_state.obs[0]
         params = self.network.init(key_params, obs)
         statistics = normalization.init(len(obs), config.whiten_floor)
         scalar = jnp.float32(0.0)
@@ -262,7 +261,7 @@ class DQN:
         key, key_act, key_reset, key_update = jax.random.split(state.key, 4)
         swept: Any = state.sweep
         config = dataclasses.replace(self.spec.config, **swept)  # swept fields are arrays
-        obs = as_array(state.env_state.obs)
+        obs: Any = state.env_state.obs
         statistics = jax.lax.cond(
             observing,
             lambda: normalization.observe(state.statistics, obs, config.whiten_floor),
@@ -274,23 +273,21 @@ class DQN:
             keys = jax.random.split(device_key(key_act), len(obs))
             action = jax.vmap(self.act, (None, 0, 0, None))(params, obs, keys, epsilon)
         with jax.named_scope("env"):
-            stepped = step(self.env, state.env_state, action, device_key(key_reset))
-        with jax.named_scope("replay"):
-            buffer = replay.add(state.replay, stepped.transition, stepped.valid)
-        with jax.named_scope("updates"):
-            before = UpdateState(*(getattr(state, name) for name in UpdateState._fields))
-            after, update_metrics = self.learn(
-                before, buffer, statistics, config, device_key(key_update)
+            env_state, transition, valid, metrics = step(
+                self.env, state.env_state, action, device_key(key_reset)
             )
+        with jax.named_scope("replay"):
+            buffer = replay.add(state.replay, transition, valid)
         state = state._replace(
-            **after._asdict(),
             statistics=statistics,
-            env_state=stepped.env_state,
+            env_state=env_state,
             replay=buffer,
             env_steps=state.env_steps + self.spec.num_envs,
             key=key,
         )
-        return state, stepped.metrics | update_metrics | {"epsilon": Mean(epsilon, jnp.ones(()))}
+        with jax.named_scope("updates"):
+            state, losses = self.learn(state, config, device_key(key_update))
+        return state, metrics | losses | {"epsilon": Mean(epsilon, jnp.ones(()))}
 
     def act(
         self, params: Params, obs: Float[Array, " obs"], key: PRNGKeyArray, epsilon: jax.Array
@@ -304,35 +301,31 @@ class DQN:
         return exploration_noise(key_noise, action, factors, levels) if levels else action
 
     def learn(
-        self,
-        state: UpdateState,
-        buffer: ReplayState,
-        statistics: RunningStatistics,
-        config: DQNConfig,
-        key: PRNGKeyArray,
-    ) -> tuple[UpdateState, Means]:
+        self, state: TrainState, config: DQNConfig, key: PRNGKeyArray
+    ) -> tuple[TrainState, Means]:
         """The updates of one iteration, once the replay holds `min_replay_size`.
 
         Returns:
           The state; `loss`, a mean over the updates made, and `skipped_updates`, the share of
           updates whose loss or gradient was not finite.
         """
-        count = self.spec.updates_per_iteration
-        capacity = buffer.data.action.shape[0]
-        ready = buffer.size >= min(self.spec.per_device(config.min_replay_size), capacity)
-        keys = jax.random.split(key, count)
+        count, capacity = self.spec.updates_per_iteration, len(state.replay.data.action)
+        ready = state.replay.size >= min(self.spec.per_device(config.min_replay_size), capacity)
+
+        def sample_and_update(learned: UpdateState, key: jax.Array) -> tuple[UpdateState, Mean]:
+            batch = self.sample(state.replay, key)
+            return self.update(learned, batch, state.statistics, config)
+
+        def all_updates(learned: UpdateState) -> tuple[UpdateState, Mean]:
+            keys = jax.random.split(key, count)
+            learned, losses = jax.lax.scan(sample_and_update, learned, keys)
+            return learned, jax.tree.map(jnp.sum, losses)
+
         none = Mean(jnp.float32(0.0), jnp.float32(0.0))
-
-        def sample_and_update(state: UpdateState, key: jax.Array) -> tuple[UpdateState, Mean]:
-            return self.update(state, self.sample(buffer, key), statistics, config)
-
-        def all_updates(state: UpdateState) -> tuple[UpdateState, Mean]:
-            state, losses = jax.lax.scan(sample_and_update, state, keys)
-            return state, jax.tree.map(jnp.sum, losses)
-
-        state, loss = jax.lax.cond(ready, all_updates, lambda state: (state, none), state)
+        learned = UpdateState(*(getattr(state, name) for name in UpdateState._fields))
+        learned, loss = jax.lax.cond(ready, all_updates, lambda same: (same, none), learned)
         skipped = Mean(ready * (count - loss.number), jnp.float32(count))
-        return state, {"loss": loss, "skipped_updates": skipped}
+        return state._replace(**learned._asdict()), {"loss": loss, "skipped_updates": skipped}
 
     def sample(self, buffer: ReplayState, key: PRNGKeyArray) -> Transition:
         """This device's share of a batch, reflected with `mirror`."""
@@ -351,7 +344,7 @@ class DQN:
         statistics: RunningStatistics,
         config: DQNConfig,
     ) -> tuple[UpdateState, Mean]:
-        """One gradient step.
+        """One gradient step, and the target network's copy if it is due.
 
         Args:
           state: the same on every device, before and after.
@@ -405,8 +398,7 @@ class DQN:
 
     def head(self, params: Params, obs: Float[Array, "*batch obs"]) -> Head:
         """The network's head for raw observations."""
-        head = self.network.apply(params, obs, method="head")
-        assert isinstance(head, Head)
+        head: Any = self.network.apply(params, obs, method="head")
         return head
 
     def fold(self, params: Params, statistics: RunningStatistics) -> Params:
@@ -487,73 +479,53 @@ def exploration_noise(
     return jnp.ravel_multi_index(tuple(digits), tuple(factors), mode="clip").astype(action.dtype)
 
 
-class Step(NamedTuple):
-    """One step of this device's envs."""
-
-    env_state: State
-    """(envs, ...) per leaf, done envs reset."""
-    transition: Transition
-    """(envs, ...) per field, before any reset; the row of a diverged env repeats another env's."""
-    valid: Bool[Array, ""]
-    """Whether every device has an env that did not diverge."""
-    metrics: Means
-    """Means over all devices: the env's, `reward`, and `diverged`, the share of diverged envs."""
-
-
-def step(env: Env, state: State, action: Int[Array, " envs"], key: PRNGKeyArray) -> Step:
+def step(
+    env: Env, state: State, action: Int[Array, " envs"], key: PRNGKeyArray
+) -> tuple[State, Transition, Bool[Array, ""], Means]:
     """Steps this device's envs once and resets those that are done.
 
-    An env has diverged if its transition is not finite; it is done, and its transition is dropped.
+    An env has diverged if its transition is not finite; it is done, and its row repeats another
+    env's.
 
     Args:
       env: unbatched.
       state: (envs, ...) per leaf.
       action: indices.
       key: for the resets.
+
+    Returns:
+      The state, done envs reset; the transitions, (envs, ...) per field, before any reset; whether
+      every device has an env that did not diverge; means over all devices of the env's metrics,
+      `reward`, and `diverged`, the share of diverged envs.
     """
     after = jax.vmap(env.step)(state, action)
-    truncation = after.info.get("truncation", jnp.zeros_like(after.done))
-    transition = Transition(
-        obs=as_array(state.obs),
-        action=action,
-        reward=after.reward,
-        terminated=after.done * (1 - truncation),
-        next_obs=as_array(after.obs),
-    )
+    obs: Any = state.obs
+    next_obs: Any = after.obs
+    terminated = after.done * (1 - after.info.get("truncation", jnp.zeros_like(after.done)))
+    transition = Transition(obs, action, after.reward, terminated, next_obs)
     finite: jax.Array = jax.vmap(all_finite)(transition)
-    after = after.replace(done=jnp.where(finite, after.done, 1.0))  # pyright: ignore
     row = jnp.where(finite, jnp.arange(len(finite)), jnp.argmax(finite))
     valid = jax.lax.pmin(finite.any().astype(jnp.int32), AXIS) > 0
-    own: dict[str, Any] = dict(after.metrics)
-    diverged: Any = jnp.where(finite, own.pop("diverged", jnp.zeros_like(after.done)), 1.0)
-    means = {k: mean_where(x, finite) for k, x in (own | {"reward": after.reward}).items()}
+    metrics: dict[str, Any] = after.metrics | {"reward": after.reward}
+    diverged = jnp.where(finite, metrics.pop("diverged", jnp.zeros_like(after.done)), 1.0)
+    means = {name: mean_where(x, finite) for name, x in metrics.items()}
     means["diverged"] = mean_where(diverged, jnp.ones_like(finite))
+    after = after.replace(done=jnp.where(finite, after.done, 1.0))  # pyright: ignore
     after = reset_done(env.reset, after, key)
-    return Step(after, jax.tree.map(lambda x: x[row], transition), valid, means)
+    return after, jax.tree.map(lambda x: x[row], transition), valid, means
 
 
-def reset_all(reset: Reset, key: PRNGKeyArray, count: int) -> State:
+def reset_all(reset: Callable[..., State], key: PRNGKeyArray, count: int) -> State:
     """`count` fresh envs, (count, ...) per leaf."""
     return jax.vmap(reset)(jax.random.split(key, count))
 
 
-def reset_done(reset: Reset, state: State, key: PRNGKeyArray) -> State:
+def reset_done(reset: Callable[..., State], state: State, key: PRNGKeyArray) -> State:
     """Replaces the done envs of a batch by fresh ones."""
-    new = reset_all(reset, key, state.reward.shape[0])
+    new = reset_all(reset, key, len(state.done))
     done = state.done.astype(bool)
 
     def choose(new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
     return jax.tree.map(choose, new, state)
-
-
-def as_array(obs: object) -> jax.Array:
-    """Returns an observation that is an array; brax also allows dictionaries.
-
-    Raises:
-      TypeError: if it is not an array.
-    """
-    if not isinstance(obs, jax.Array):
-        raise TypeError(f"the env observes {type(obs).__name__}; this DQN takes arrays")
-    return obs

@@ -4,12 +4,20 @@ Transitions arrive in batches of a fixed size, one row per env. The capacity is 
 batches, so every write is one contiguous block.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+Symmetries: TypeAlias = tuple[
+    Int[np.ndarray, "g obs"], Float[np.ndarray, "g obs"], Int[np.ndarray, "g actions"]
+]
+"""The g reflections of an env, including the identity: `obs_index`, `obs_sign`, `action_index`.
+
+Reflection k maps obs to obs[obs_index[k]] * obs_sign[k], and action to action_index[k, action].
+"""
 
 
 class Transition(NamedTuple):
@@ -20,8 +28,7 @@ class Transition(NamedTuple):
     """Index, int32."""
     reward: Float[Array, "*rows"]
     terminated: Float[Array, "*rows"]
-    """1 after a termination, 0 otherwise, also after a truncation: only terminations stop
-    bootstrapping."""
+    """1 after a termination, else 0, also after a truncation: only the former end bootstrapping."""
     next_obs: Float[Array, "*rows obs"]
     """The observation before any reset."""
 
@@ -56,18 +63,12 @@ def init(example: Transition, capacity: int, batch: int) -> ReplayState:
 
 
 def add(state: ReplayState, batch: Transition, valid: Bool[Array, ""] | bool = True) -> ReplayState:
-    """Overwrites the oldest rows with a batch.
-
-    Args:
-      state: the buffer.
-      batch: (batch, ...) per field.
-      valid: if false, the buffer does not change.
+    """Overwrites the oldest rows with a batch, (batch, ...) per field, if it is `valid`.
 
     Raises:
       ValueError: if the batch does not divide the capacity.
     """
-    capacity = state.data.action.shape[0]
-    rows = batch.action.shape[0]
+    capacity, rows = len(state.data.action), len(batch.action)
     if capacity % rows:
         raise ValueError(f"batch of {rows} rows does not divide the capacity, {capacity}")
 
@@ -90,38 +91,16 @@ def sample(state: ReplayState, key: PRNGKeyArray, batch_size: int) -> Transition
     return jax.tree.map(lambda ring: ring.at[rows].get(mode="promise_in_bounds"), state.data)
 
 
-class Symmetries(Protocol):
-    """The g reflections of an env, including the identity.
-
-    Reflection k maps obs to obs[obs_index[k]] * obs_sign[k], and action to action_index[k, action].
-    """
-
-    @property
-    def obs_index(self) -> Int[np.ndarray, "g obs"]:
-        """Entry of the observation that comes to each place."""
-        ...
-
-    @property
-    def obs_sign(self) -> Float[np.ndarray, "g obs"]:
-        """Its sign there, 1 or -1."""
-        ...
-
-    @property
-    def action_index(self) -> Int[np.ndarray, "g actions"]:
-        """Index that each action becomes."""
-        ...
-
-
 def reflect(batch: Transition, symmetries: Symmetries, key: PRNGKeyArray) -> Transition:
     """Replaces each transition of a batch by one of its reflections, chosen at random."""
-    which = jax.random.randint(key, batch.action.shape, 0, len(symmetries.obs_index))
+    obs_index, obs_sign, action_index = map(jnp.asarray, symmetries)
+    which = jax.random.randint(key, batch.action.shape, 0, len(obs_index))
 
     def reflected(obs: jax.Array) -> jax.Array:
-        index = jnp.asarray(symmetries.obs_index)[which]
-        return jnp.take_along_axis(obs, index, axis=-1) * jnp.asarray(symmetries.obs_sign)[which]
+        return jnp.take_along_axis(obs, obs_index[which], axis=-1) * obs_sign[which]
 
     return batch._replace(
         obs=reflected(batch.obs),
         next_obs=reflected(batch.next_obs),
-        action=jnp.asarray(symmetries.action_index)[which, batch.action],
+        action=action_index[which, batch.action],
     )

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +97,16 @@ def test_one_seed_of_several_leaves_the_others_alone(make: Callable[..., DQN]) -
         np.testing.assert_array_equal(leaf[1], 0)
 
 
-def stepped(env: Env, obs: list[list[float]], action: list[int]) -> Any:
+class Stepped(NamedTuple):
+    """What `step` returns."""
+
+    env_state: Any
+    transition: Any
+    valid: Any
+    metrics: Any
+
+
+def stepped(env: Env, obs: list[list[float]], action: list[int]) -> Stepped:
     """What `step` makes of envs at these observations, on each of two devices alike."""
     state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), len(obs)))
     state = state.replace(obs=jnp.asarray(obs))
@@ -106,7 +115,7 @@ def stepped(env: Env, obs: list[list[float]], action: list[int]) -> Any:
         return step(env, state, jnp.asarray(action, jnp.int32), key)
 
     keys = jnp.stack([jax.random.PRNGKey(1)] * 2)
-    return jax.device_get(jax.jit(jax.vmap(one, axis_name=AXIS))(keys))
+    return Stepped(*jax.device_get(jax.jit(jax.vmap(one, axis_name=AXIS))(keys)))
 
 
 def test_a_diverged_env_is_reset_and_its_row_is_another_envs() -> None:
@@ -129,19 +138,9 @@ def test_where_no_row_is_finite_none_is_stored() -> None:
     assert got.metrics["reward"].number[0] == 0
 
 
-def test_a_diverged_env_that_was_not_done_is_reset_all_the_same() -> None:
-    class Endless(probes.Faulty):
-        def step(self, state: Any, action: jax.Array) -> Any:
-            return super().step(state, action).replace(done=jnp.float32(0.0))
+def test_an_env_may_report_its_own_divergence_and_need_not_end_then() -> None:
+    """One of five reports it, two have a reward that is not finite; none says that it is done."""
 
-    got = stepped(Endless({"reward": math.nan}, 1.0), [[0.1, 1.0], [0.2, 0.0]], [1, 1])
-    diverged, other = got.env_state.obs[0]
-    np.testing.assert_array_equal(other, (0.0, 0.0))  # where its step led
-    assert diverged[0] != 0
-    assert diverged[1] == 1
-
-
-def test_what_the_env_reports_as_diverged_is_counted_with_what_is_found() -> None:
     class Honest(probes.Faulty):
         def reset(self, rng: jax.Array) -> Any:
             state = super().reset(rng)
@@ -150,14 +149,15 @@ def test_what_the_env_reports_as_diverged_is_counted_with_what_is_found() -> Non
         def step(self, state: Any, action: jax.Array) -> Any:
             after = super().step(state, action)
             own = (action == 1).astype(jnp.float32)
-            return after.replace(metrics=after.metrics | {"diverged": own})
+            return after.replace(done=0 * own, metrics=after.metrics | {"diverged": own})
 
-    got = stepped(
-        Honest({"reward": math.nan}, 1.0),
-        [[0.1, 1.0], [0.1, 1.0], [0.1, 0.0], [0.1, 0.0], [0.1, 0.0]],
-        [0, 1, 0, 0, 1],
-    )
+    obs = [[0.1, 1.0], [0.1, 1.0], [0.1, 0.0], [0.1, 0.0], [0.1, 0.0]]
+    got = stepped(Honest({"reward": math.nan}, 1.0), obs, [0, 1, 0, 0, 1])
     assert got.metrics["diverged"].value()[0] == pytest.approx(3 / 5)
+    after = got.env_state.obs[0]
+    np.testing.assert_array_equal(after[2:], 0)  # where their step led
+    assert (after[:2, 0] != 0).all(), "reset"
+    np.testing.assert_array_equal(after[:2, 1], 1)
 
 
 def test_all_envs_diverging_at_once_is_no_end(make: Callable[..., DQN]) -> None:

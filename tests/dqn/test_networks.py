@@ -25,22 +25,6 @@ def random_obs(*shape: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(1).normal(size=shape), jnp.float32)
 
 
-@pytest.mark.parametrize(
-    ("factors", "outputs", "actions"),
-    [((441,), 441, 441), ((21, 21), 42, 441), ((2, 3, 4), 9, 24)],
-)
-def test_shapes(factors: tuple[int, ...], outputs: int, actions: int) -> None:
-    network = QNetwork((16, 8), factors)
-    params = jax.eval_shape(network.init, KEY, jnp.zeros(34))
-    shapes = jax.tree.map(lambda x: x.shape, params["params"])
-    assert shapes["hidden_0"] == {"kernel": (34, 16), "bias": (16,)}
-    assert shapes["hidden_1"] == {"kernel": (16, 8), "bias": (8,)}
-    assert shapes["head"] == {"kernel": (8, outputs), "bias": (outputs,)}
-    for batch in ((), (5,), (2, 3)):
-        obs = jax.ShapeDtypeStruct((*batch, 34), jnp.float32)
-        assert jax.eval_shape(network.apply, params, obs).shape == (*batch, actions)
-
-
 @pytest.mark.parametrize("factors", [(21, 21), (2, 3, 4)])
 def test_value_of_an_action_is_the_sum_of_its_levels(factors: tuple[int, ...]) -> None:
     """An action's index is a mixed-radix number; the joint head gives the levels' own values."""

@@ -65,16 +65,6 @@ def test_a_variance_rounded_below_zero_counts_as_none() -> None:
     np.testing.assert_allclose(matrix[1, 1], 100, rtol=1e-4)
 
 
-def test_whitened_observations_are_uncorrelated_and_of_equal_size() -> None:
-    """Three nearly equal sensors: after whitening, covariance I where there is variance."""
-    rng = np.random.default_rng(0)
-    common = rng.normal(size=(4_000, 1))
-    obs = 5 + common + 0.1 * rng.normal(size=(4_000, 3))
-    got = statistics_of(np.split(obs, 40))
-    white = (obs - np.asarray(got.mean)) @ np.asarray(got.matrix)
-    np.testing.assert_allclose(np.cov(white.T), np.eye(3), atol=0.15)
-
-
 @pytest.mark.parametrize("hidden", [(8, 6), (8,)])
 @pytest.mark.parametrize("radial", [False, True])
 def test_folded_parameters_take_raw_observations(radial: bool, hidden: tuple[int, ...]) -> None:
