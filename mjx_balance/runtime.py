@@ -35,30 +35,20 @@ import numpy as np
 
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts it"
-ACTION = "grid"
-"""The only kind of action: a row of `actions.table_m`."""
-IMU = 6
-"""Gyro x, y and z, accelerometer x, y and z."""
-MOST_BYTES = 64 * 2**20
-"""Greatest size of a policy file, bytes."""
-MOST_WHOLE = 100_000
-"""Bound of a manifest's numbers."""
-MOMENTARY = ("height",)
-"""Sensors with one sample per decision and no history."""
-MOST_READ = 1_000_000
-"""Greatest number of samples that all inputs together average."""
-GYRO_MOST = 35.0
-"""Greatest gyro reading, rad/s; the widest usual range is 2,000 deg/s."""
-ACCEL_MOST = 160.0
-"""Greatest accelerometer reading, m/s^2; a usual range is 16 g."""
+ACTION = "grid"  #: the only kind of action: a row of `actions.table_m`
+IMU = 6  #: gyro x, y and z, accelerometer x, y and z
+MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
+MOST_WHOLE = 100_000  #: bound of a manifest's numbers
+MOMENTARY = ("height",)  #: sensors with one sample per decision and no history
+MOST_READ = 1_000_000  #: greatest number of samples that all inputs together average
+GYRO_MOST = 35.0  #: greatest gyro reading, rad/s; the widest usual range is 2,000 deg/s
+ACCEL_MOST = 160.0  #: greatest accelerometer reading, m/s^2; a usual range is 16 g
 WEIGHT = (0.5 * 9.81, 1.5 * 9.81)
 """Least and greatest norm of a decision's mean acceleration, m/s^2; pushes give 9.2 to 11."""
 LEAN_MOST = 40.0
 """Greatest angle of that mean from z, deg. A fall has 6 deg, but a push can look like 29."""
-AWAY_MOST = 0.5
-"""Greatest error of a joint at a decision, rad; pushes give 0.03."""
-KNEE_SLACK = 0.1
-"""Tolerance of a knee's reading beyond its stops, rad."""
+AWAY_MOST = 0.5  #: greatest error of a joint at a decision, rad; pushes give 0.03
+KNEE_SLACK = 0.1  #: tolerance of a knee's reading beyond its stops, rad
 LATE_SAMPLES = 5
 """Longest time between two calls, and greatest error of a decision's length, sample periods."""
 
@@ -107,21 +97,13 @@ class Controller:
         path = Path(path)
         try:
             self.manifest, weights = _read(path)
-            self._set_up(self.manifest)
-            self._network = _Network(self.manifest["network"], self._inputs.size, weights)
-            if len(self._table) != math.prod(self._network.factors):
-                raise PolicyFileError("its action table is not what its network chooses from")
-        except PolicyFileError as error:
-            raise PolicyFileError(f"{path} cannot be used: {error}") from error
-        except KeyError as error:
-            raise PolicyFileError(f"{path} cannot be used: its manifest lacks {error}") from error
-        except (TypeError, ValueError, OverflowError, AttributeError) as error:
-            message = f"{path} cannot be used: a part of its manifest has the wrong type: {error}"
-            raise PolicyFileError(message) from error
+            self._set_up(self.manifest, weights)
+        except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+            raise PolicyFileError(f"{path} cannot be used: {_reason(error)}") from error
         self._clock = clock
         self.reset()
 
-    def _set_up(self, manifest: dict[str, Any]) -> None:
+    def _set_up(self, manifest: dict[str, Any], weights: dict[str, np.ndarray]) -> None:
         """Reads the manifest, and allocates the histories."""
         self._legs = legs = _Legs(manifest["robot"])
         self.joints: list[list[str]] = [list(leg["joints"]) for leg in manifest["robot"]["legs"]]
@@ -151,6 +133,9 @@ class Controller:
         # The history up to the last decision, then the samples since.
         self._imu = np.empty((self._history + self.decision_samples, IMU))
         self._commands = np.empty((inputs.lookback("command"), len(self.joints)))
+        self._network = _Network(manifest["network"], inputs.size, weights)
+        if len(self._table) != math.prod(self._network.factors):
+            raise PolicyFileError("its action table is not what its network chooses from")
 
         low, high = legs.limits()
         most = np.repeat((GYRO_MOST, ACCEL_MOST), 3)
@@ -424,21 +409,28 @@ class _Legs:
 class _Network:
     """The Q-network; it computes the best action only."""
 
-    def __init__(
-        self, network: dict[str, Any], inputs: int, weights: dict[str, np.ndarray]
-    ) -> None:
+    def __init__(self, network: Any, inputs: int, weights: dict[str, np.ndarray]) -> None:
         self.factors = [_whole("factors", levels, 1) for levels in network["factors"]]
         self._radial = network["radial"] is True
         hidden = [_whole("hidden_sizes", width, 1) for width in network["hidden_sizes"]]
         rows, columns = [inputs, *hidden], [*hidden, sum(self.factors)]
+        names = [f"hidden_{k}" for k in range(len(hidden))] + ["head"]
+        shapes: dict[str, tuple[int, ...]] = {}
         if self._radial:
             rows[-1] += inputs
             columns[-1] = 1 + len(self.factors)
-        names = [f"hidden_{k}" for k in range(len(hidden))] + ["head"]
-        self._layers = [
-            (_weight(weights, f"{name}/kernel", (n, m)), _weight(weights, f"{name}/bias", (m,)))
-            for name, n, m in zip(names, rows, columns)
-        ]
+            shapes = {"profile": (4,), "stretch": (len(self.factors),)}
+        for name, n, m in zip(names, rows, columns):
+            shapes.update({f"{name}/kernel": (n, m), f"{name}/bias": (m,)})
+        extra = sorted(set(weights) - set(shapes))
+        if extra:
+            raise PolicyFileError(f"weight {extra[0]!r:.80} is none of this network's")
+        for name, shape in shapes.items():
+            if name not in weights or weights[name].shape != shape:
+                raise PolicyFileError(f"weight {name} is missing or not of shape {shape}")
+            if not np.isfinite(weights[name]).all():
+                raise PolicyFileError(f"weight {name} holds values that are not finite numbers")
+        self._layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
 
     def greedy(self, observation: np.ndarray) -> int:
         """Index of the best action; raises `_Unsafe` if an output is not finite."""
@@ -474,18 +466,19 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         if path.stat().st_size > MOST_BYTES:
             raise PolicyFileError(f"it has {path.stat().st_size} bytes, and no policy so many")
         content = path.read_bytes()
+    except OSError as error:
+        raise PolicyFileError(f"it cannot be read: {error.strerror}") from error
+    try:
         size = int.from_bytes(content[:8], "little")
         if size > len(content) - 8:
             raise ValueError("it ends within its header")
-        header = json.loads(content[8 : 8 + size])
+        header, numbers = json.loads(content[8 : 8 + size]), memoryview(content)[8 + size :]
         metadata = header.pop("__metadata__", {})
-        weights = {name: _array(name, entry, content[8 + size :]) for name, entry in header.items()}
-        if sum(4 * array.size for array in weights.values()) != len(content) - 8 - size:
+        weights = {name: _array(name, entry, numbers) for name, entry in header.items()}
+        if sum(array.nbytes for array in weights.values()) != len(numbers):
             raise ValueError("its length is not that of its weights")
     except PolicyFileError:
         raise
-    except OSError as error:
-        raise PolicyFileError(f"it cannot be read: {error.strerror}") from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise PolicyFileError(f"it is damaged or no safetensors file: {error}") from error
     try:
@@ -502,22 +495,22 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return manifest, weights
 
 
-def _array(name: str, entry: dict[str, Any], content: bytes) -> np.ndarray:
+def _array(name: str, entry: dict[str, Any], numbers: memoryview) -> np.ndarray:
     if entry["dtype"] != "F32":
         raise PolicyFileError(f"weight {name} is {entry['dtype']}; it must be F32 (float32)")
     begin, end = entry["data_offsets"]
-    if not 0 <= begin <= end <= len(content):
+    if not 0 <= begin <= end <= len(numbers):
         raise ValueError(f"weight {name} lies outside the file")
-    return np.frombuffer(content[begin:end], "<f4").astype(np.float32).reshape(entry["shape"])
+    return np.frombuffer(numbers[begin:end], "<f4").astype(np.float32).reshape(entry["shape"])
 
 
-def _weight(weights: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Checks shape and values of a weight, and returns it."""
-    if name not in weights or weights[name].shape != shape:
-        raise PolicyFileError(f"weight {name} is missing or not of shape {shape}")
-    if not np.isfinite(weights[name]).all():
-        raise PolicyFileError(f"weight {name} holds values that are not finite numbers")
-    return weights[name]
+def _reason(error: Exception) -> str:
+    """What is wrong with a file, in a sentence."""
+    if isinstance(error, PolicyFileError):
+        return str(error)
+    if isinstance(error, KeyError):
+        return f"its manifest lacks {error}"
+    return f"a part of its manifest has the wrong type: {error}"
 
 
 def _number(name: str, value: Any, least: float, most: float) -> float:

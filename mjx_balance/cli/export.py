@@ -8,8 +8,7 @@ import tyro
 
 from mjx_balance.cli.common import complain
 from mjx_balance.errors import how_to_install
-from mjx_balance.policy.convert import convert_policy
-from mjx_balance.policy.file import find_policy, load_policy
+from mjx_balance.policy.file import convert_policy, find_policy, load_policy
 from mjx_balance.policy.manifest import FORMAT_VERSION
 
 

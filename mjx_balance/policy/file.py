@@ -12,7 +12,7 @@ import safetensors.numpy
 
 from mjx_balance.files.run_folder import RunFolder, write_atomically
 from mjx_balance.files.text import quote
-from mjx_balance.policy.manifest import PolicyError
+from mjx_balance.policy.manifest import PolicyError, naming, upgrade
 from mjx_balance.policy.network import Policy
 
 MOST_BYTES = 64 * 2**20
@@ -59,6 +59,22 @@ def write_policy(
     content = safetensors.numpy.save(dict(weights), metadata={"manifest": json.dumps(manifest)})
     write_atomically(Path(path), content)
     return policy
+
+
+def convert_policy(path: Path, out: Path) -> Policy:
+    """Writes a policy file of format 4 or 5 in format 5, atomically, with the same weights.
+
+    Args:
+      path: file to read.
+      out: file to write; may be the same.
+
+    Raises:
+      PolicyError: if `path` is not a policy of these formats.
+      OSError: if `out` cannot be written; an old file then stays.
+    """
+    manifest, weights = read_policy(path)
+    with naming(path):
+        return write_policy(out, weights, upgrade(manifest))
 
 
 def shipped_policies() -> dict[str, Path]:
@@ -110,10 +126,8 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     """
     path = find_policy(path)
     manifest, weights = read_policy(path)
-    try:
+    with naming(path):
         return Policy(manifest, weights)
-    except PolicyError as error:
-        raise PolicyError(f"{path} cannot be used: {error}") from error
 
 
 def read_policy(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
@@ -122,32 +136,30 @@ def read_policy(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
     Raises:
       PolicyError: if the file is not safetensors with float32 weights and a JSON manifest.
     """
-    if path.stat().st_size > MOST_BYTES:
-        raise PolicyError(
-            f"{path} has {path.stat().st_size} bytes; no policy has more than {MOST_BYTES}"
-        )
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise PolicyError(f"{path} has {size} bytes; no policy has more than {MOST_BYTES}")
     try:
-        return _read(path)
+        with naming(path), safetensors.safe_open(path, framework="numpy") as file:
+            return _manifest(file), {name: _weight(file, name) for name in file.keys()}  # noqa: SIM118
     except (safetensors.SafetensorError, OSError, UnicodeDecodeError) as error:
         raise PolicyError(f"{path} is damaged or no safetensors file: {error}") from error
-    except PolicyError as error:
-        raise PolicyError(f"{path} cannot be used: {error}") from error
 
 
-def _read(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
-    with safetensors.safe_open(path, framework="numpy") as file:
-        text = (file.metadata() or {}).get("manifest")
-        if text is None:
-            raise PolicyError("it carries no manifest, so it is no policy of mjx_balance")
-        if len(text) > MOST_MANIFEST:
-            raise PolicyError(f"its manifest has {len(text)} characters, more than {MOST_MANIFEST}")
-        for name in file.keys():  # noqa: SIM118
-            # Checked before reading: NumPy lacks some dtypes of safetensors.
-            if file.get_slice(name).get_dtype() != "F32":
-                kind = file.get_slice(name).get_dtype()
-                raise PolicyError(f"weight {quote(name)} is {kind}; it must be F32 (float32)")
-        weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+def _manifest(file: Any) -> Any:
+    text = (file.metadata() or {}).get("manifest")
+    if text is None:
+        raise PolicyError("it carries no manifest, so it is no policy of mjx_balance")
+    if len(text) > MOST_MANIFEST:
+        raise PolicyError(f"its manifest has {len(text)} characters, more than {MOST_MANIFEST}")
     try:
-        return json.loads(text), weights
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"its manifest is no JSON: {error}") from error
+
+
+def _weight(file: Any, name: str) -> np.ndarray:
+    kind = file.get_slice(name).get_dtype()
+    if kind != "F32":  # checked before reading: NumPy lacks some dtypes of safetensors
+        raise PolicyError(f"weight {quote(name)} is {kind}; it must be F32 (float32)")
+    return file.get_tensor(name)

@@ -4,13 +4,15 @@
 `versions` and `training` are provenance; all other parts follow from `config` and `robot`.
 """
 
+import contextlib
 import importlib.metadata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from mjx_balance.config import ACTION_AXES, Config, ConfigError, check, from_dict, to_dict
+from mjx_balance.config import ACTION_AXES, Config, check, from_dict, to_dict
 from mjx_balance.errors import InputError
 from mjx_balance.files.text import quote
+from mjx_balance.files.validation import parse
 from mjx_balance.policy import heads
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import check_robot
@@ -19,7 +21,7 @@ from mjx_balance.task.observation import input_rows
 
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 CONVERTIBLE = 4
-"""Older version that `convert.py` converts."""
+"""Older version that `upgrade` converts."""
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts a file of version 4"
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 """Packages whose versions a manifest records."""
@@ -27,6 +29,15 @@ VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 
 class PolicyError(InputError):
     """Unusable policy file; the message says why."""
+
+
+@contextlib.contextmanager
+def naming(subject: object) -> Iterator[None]:
+    """Says of invalid input what cannot be used: a file, or a part of one."""
+    try:
+        yield
+    except InputError as error:
+        raise PolicyError(f"{subject} cannot be used: {error}") from error
 
 
 def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) -> dict[str, Any]:
@@ -95,32 +106,38 @@ def read_manifest(manifest: Any) -> tuple[Config, Robot]:
         if value != expected:
             remedy = REMEDY if value == CONVERTIBLE else ""
             raise PolicyError(f"{name} is {quote(value)}; this release reads {expected!r}{remedy}")
-    config, robot = config_and_robot(manifest)
+    config, robot = _config_and_robot(manifest)
     for part, expected in describe(config, robot).items():
         if manifest.get(part) != expected:
             raise PolicyError(f"its {part} is not what its own config gives")
     return config, robot
 
 
-def config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
-    """Returns config and robot of a manifest of format 4 or 5.
+def upgrade(manifest: Any) -> Any:
+    """Returns a manifest of format 4 in format 5, and anything else unchanged.
+
+    Format 4 has only names and scales of the observation; format 5 has the rows as `inputs`.
 
     Raises:
       PolicyError: if a part has the wrong type, or config or robot are invalid.
     """
-    kinds = {"config": dict, "robot": dict, "scene_hash": str, "versions": dict, "training": dict}
-    for name, kind in kinds.items():
-        if not isinstance(manifest.get(name), kind):
-            right = {dict: "a JSON object", str: "a string"}[kind]
-            raise PolicyError(f"its {name} is {quote(manifest.get(name))}; it must be {right}")
-    try:
-        robot = from_dict(Robot, manifest["robot"])
-    except ValueError as error:
-        raise PolicyError(f"its robot cannot be used: {error}") from error
-    try:
-        return check_robot(check(from_dict(Config, manifest["config"])), robot), robot
-    except ConfigError as error:
-        raise PolicyError(f"its config cannot be used: {error}") from error
+    if not isinstance(manifest, dict):
+        return manifest
+    if (manifest.get("format"), manifest.get("version")) != (FORMAT, CONVERTIBLE):
+        return manifest
+    parts = describe(*_config_and_robot(manifest)) | {"version": FORMAT_VERSION}
+    kept = ("format", "config", "scene_hash", "versions", "training")
+    return {name: manifest[name] for name in kept} | parts
+
+
+def _config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
+    """Checks all parts of a manifest of format 4 or 5 that do not follow from others."""
+    for name, kind in (("scene_hash", str), ("versions", dict), ("training", dict)):
+        parse(kind, manifest.get(name), PolicyError, name=name)
+    with naming("its robot"):
+        robot = from_dict(Robot, manifest.get("robot"))
+    with naming("its config"):
+        return check_robot(check(from_dict(Config, manifest.get("config"))), robot), robot
 
 
 def installed_version(package: str) -> str | None:

@@ -38,13 +38,12 @@ class Policy:
         self.observation_size = len(manifest["inputs"])
         hidden = self.config.dqn.hidden_sizes
         names = [f"hidden_{i}" for i in range(len(hidden))] + ["head"]
-        rows = [self.observation_size, *hidden]
-        columns = [*hidden, sum(self.factors)]
+        rows, columns = [self.observation_size, *hidden], [*hidden, sum(self.factors)]
         shapes: dict[str, tuple[int, ...]] = {}
         if self.radial:
             rows[-1] += self.observation_size
             columns[-1] = 1 + len(self.factors)
-            shapes |= {"profile": (4,), "stretch": (len(self.factors),)}
+            shapes = {"profile": (4,), "stretch": (len(self.factors),)}
         for name, n, m in zip(names, rows, columns, strict=True):
             shapes |= {f"{name}/kernel": (n, m), f"{name}/bias": (m,)}
         _check_weights(weights, shapes)
@@ -97,8 +96,7 @@ class Policy:
 def _check_weights(
     weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]
 ) -> None:
-    extra = sorted(set(weights) - set(shapes))
-    if extra:
+    if extra := sorted(set(weights) - set(shapes)):
         raise PolicyError(f"weight {quote(extra[0])} is none of this network's")
     for name, shape in shapes.items():
         if name not in weights:

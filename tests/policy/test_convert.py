@@ -95,8 +95,8 @@ def test_a_policy_of_todays_format_is_copied(tmp_path: Path) -> None:
         ("version", 3, "version is 3; this release reads 5"),
         ("config", {"wings": 2}, "its config cannot be used: unknown field 'wings'"),
         ("robot", {}, "its robot cannot be used"),
-        ("scene_hash", None, "its scene_hash is None; it must be a string"),
-        ("training", [], r"its training is \[\]; it must be a JSON object"),
+        ("scene_hash", None, "scene_hash is None; it must be a text"),
+        ("training", [], r"training is \[\]; it must map names to values"),
     ],
 )
 def test_what_is_no_policy_is_not_converted(

@@ -29,7 +29,7 @@ NAMES = ["shipped", *HEADS]
 
 @pytest.fixture(scope="module")
 def observations() -> np.ndarray:
-    """(10,000, 136) what the shipped policy sees in 20 s on 100 boards, a quarter with kicks."""
+    """(1,000, 136) of the shipped policy in 2 s of 100 scenarios, a quarter of them with pushes."""
     policy = load_policy(SHIPPED)
     seen = []
 
@@ -38,7 +38,7 @@ def observations() -> np.ndarray:
         return policy(view.obs)
 
     for suite in ("corner", "noise", "latency", "push"):
-        run_suite(policy_scene(policy), watched, suite, 25, 20.0, 3)
+        run_suite(policy_scene(policy), watched, suite, 25, 2.0, 3)
     return np.concatenate(seen).astype(np.float32)
 
 
@@ -70,24 +70,22 @@ def policy(request: pytest.FixtureRequest) -> Policy:
     return make_policy(request.param)
 
 
-@pytest.mark.parametrize("batch", [pytest.param(1, marks=pytest.mark.slow), 10_000])
+@pytest.mark.parametrize("batch", [1, 1_000])
 def test_values_and_actions_equal_numpys(
     policy: Policy, batch: int, observations: np.ndarray
 ) -> None:
-    assert observations.shape == (10_000, 136)
+    assert observations.shape == (1_000, 136)
     expected, chosen = policy.q_values(observations), policy(observations)
     assert len(np.unique(chosen)) > 20, "the policy does choose"
     run = running(policy)
     values, actions = (
         np.concatenate(parts)
-        for parts in zip(*map(run, np.split(observations, 10_000 // batch)), strict=True)
+        for parts in zip(*map(run, np.split(observations, 1_000 // batch)), strict=True)
     )
     assert (values.dtype, actions.dtype) == (np.float32, np.int64)
-    assert (values.shape, actions.shape) == ((10_000, 441), (10_000,))
-    worst, same = np.abs(values - expected).max(), np.mean(actions == chosen)
-    print(f"values differ by {worst:.1e} at most, {same:.2%} of the actions are the same")
-    assert worst <= 1e-5
-    assert same >= 0.9999
+    assert (values.shape, actions.shape) == ((1_000, 441), (1_000,))
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(actions, chosen)
 
 
 def test_no_observation_gives_no_action(policy: Policy) -> None:
@@ -198,19 +196,3 @@ def test_without_the_package_onnx_it_says_so(
     assert "; the extra onnx brings it: `pip install -e '.[onnx]'` in a checkout, or" in said
     assert said.count("\n") == 1
     assert not os.listdir(tmp_path)
-
-
-def test_a_full_disk_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "p.onnx"
-    file.write_text("old")
-
-    def full(number: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    assert main(["export", str(SHIPPED), "--out", str(file)]) == 2
-    assert capsys.readouterr().err == f"mjx-balance: cannot write {file}: No space left on device\n"
-    assert os.listdir(tmp_path) == ["p.onnx"]
-    assert file.read_text() == "old"

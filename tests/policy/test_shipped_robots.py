@@ -13,12 +13,11 @@ MAKERS = tuple(name for name in shipped() if name != "quadruped")
 
 def test_each_robot_has_one() -> None:
     assert set(MAKERS) == set(shipped_policies()) - {"best"}
+    policy_scene(load_policy("go2"))  # fails if the scene has changed
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=() if name == "go2" else pytest.mark.slow) for name in MAKERS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MAKERS)
 def test_it_holds_its_robot_as_level_as_who_knows_the_boards_rate(name: str) -> None:
     """No falls, and at most 1.15 times the mean tilt, over 8 held-out scenarios of 20 s."""
     policy = load_policy(name)
