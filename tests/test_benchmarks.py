@@ -388,36 +388,6 @@ def test_rows_stay_when_a_contender_fails(
     assert not page.exists()
 
 
-def counting(work: int) -> Any:
-    """A pretended buffer for `benchmarks/replay.py`: (adds, samples), and some work."""
-    one = jnp.zeros(1)
-
-    def sample(state: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
-        spent = jax.lax.fori_loop(0, work, lambda k, x: jnp.sin(x + k), 0.1 * state.sum())
-        return state + jnp.asarray((0, 1)) + (0 * spent).astype(int), one
-
-    return types.SimpleNamespace(
-        init=lambda: jnp.zeros(2, int),
-        add=lambda state, batch: state + jnp.asarray((1, 0)),
-        sample=sample,
-    )
-
-
-def test_replay_compares_as_many_adds_and_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = load("replay", monkeypatch)
-    monkeypatch.setattr(module, "SAMPLES", 1)
-    run = module.program(counting(1), lambda number: None, 8, 3)
-    state, _ = run(jnp.zeros(2, int), jax.random.PRNGKey(0))
-    assert state.tolist() == [8, 24]
-    fast, slow = counting(1), counting(30_000)
-    for ours, others, low, high in ((slow, (fast, slow), 0, 0.5), (fast, (slow, slow), 2, 1e9)):
-        contenders = dict(zip(("ours", "a", "b"), (ours, *others), strict=True))
-        monkeypatch.setattr(module, "buffers", lambda *size, found=contenders: found)
-        rows = module.measure(1, 256, 3)
-        assert [row["buffer"] for row in rows] == ["filling", "full"]
-        assert all(low < row["ours / best other"] < high for row in rows)
-
-
 def test_a_threshold_is_reached_by_a_validation_without_a_fall_in_both_suites(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -46,31 +46,20 @@ class Witness:
     """A pytest plugin that writes down which test runs, and which one failed."""
 
     def __init__(self, folder: Path):
-        """Writes into `folder`."""
         self.running, self.failed = folder / "running.txt", folder / "failed.txt"
         for file in (self.running, self.failed):
             file.unlink(missing_ok=True)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """Called by pytest before every test."""
         self.running.write_text(nodeid)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Called by pytest after every phase of a test."""
         if report.failed:
             self.failed.write_text(report.nodeid)
 
 
 def noticed(groups: list[list[str]], seconds: float) -> str | None:
-    """Runs groups of test files until the first failure; of the nearest the slow tests too.
-
-    Args:
-      groups: paths from the repository's root, run in this order.
-      seconds: how long to go on for.
-
-    Returns:
-      What failed, or None if nothing did in the time.
-    """
+    """Runs groups of test files until the first failure, the nearest with their slow tests."""
     until = time.monotonic() + seconds
     runs: list[tuple[list[str], str | None]] = [(group, None) for group in groups]
     runs[2:2] = [(group, "slow and not sb3 and not long") for group in groups[:1]]
@@ -86,8 +75,8 @@ def failing(files: Iterable[str], seconds: float, marker: str | None = None) -> 
 
     Args:
       files: paths from the repository's root, run in this order.
-      seconds: how long to go on for.
-      marker: which of their tests, as pytest's `-m`; None: those that run by default.
+      seconds: for how long to run.
+      marker: their tests, as pytest's `-m`; None: those that run by default.
 
     Returns:
       What failed, or None if nothing did in the time.
