@@ -58,7 +58,6 @@ class DQNSpec:
     """
 
     config: DQNConfig
-    """The algorithm."""
     num_envs: int
     """Envs over all devices."""
     num_env_steps: int
@@ -115,7 +114,6 @@ class TrainState(NamedTuple):
     """For raw observations: each copy includes the whitening at its time."""
     opt_state: optax.OptState
     statistics: RunningStatistics
-    """Statistics of the observations."""
     env_state: State
     """(num_envs, ...) per leaf, sharded."""
     replay: ReplayState
@@ -254,9 +252,6 @@ class DQN:
         Args:
           state: this device's part of the state of one run.
           observing: whether to add the observations to the statistics.
-
-        Returns:
-          The state and the metrics of the iteration.
         """
         key, key_act, key_reset, key_update = jax.random.split(state.key, 4)
         swept: Any = state.sweep
@@ -349,8 +344,8 @@ class DQN:
         Args:
           state: the same on every device, before and after.
           batch: this device's share, (share, ...) per field.
-          statistics: of the observations.
-          config: the algorithm.
+          statistics: for the whitening.
+          config: with the swept fields of this run.
 
         Returns:
           The state, unchanged if loss or gradient are not finite; the loss over all devices, as a
@@ -486,12 +481,6 @@ def step(
 
     An env has diverged if its transition is not finite; it is done, and its row repeats another
     env's.
-
-    Args:
-      env: unbatched.
-      state: (envs, ...) per leaf.
-      action: indices.
-      key: for the resets.
 
     Returns:
       The state, done envs reset; the transitions, (envs, ...) per field, before any reset; whether

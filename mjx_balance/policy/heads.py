@@ -92,16 +92,6 @@ class Radial:
 Head = Additive | Radial
 
 
-def network_factors(head: str, levels: Sequence[int]) -> tuple[int, ...]:
-    """Factors of a head over a grid of actions: one for all actions ("joint"), or one per axis.
-
-    Args:
-      head: "joint", "factored" or "radial".
-      levels: number of levels of each axis.
-    """
-    return (math.prod(levels),) if head == "joint" else tuple(levels)
-
-
 @functools.cache
 def points(factors: tuple[int, ...]) -> np.ndarray:
     """The radial head's points x(a) of all actions, (prod(factors), len(factors)), -1 to 1."""

@@ -6,6 +6,7 @@
 
 import contextlib
 import importlib.metadata
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -13,7 +14,6 @@ from mjx_balance.config import ACTION_AXES, Config, check, from_dict, to_dict
 from mjx_balance.errors import InputError
 from mjx_balance.files.text import quote
 from mjx_balance.files.validation import parse
-from mjx_balance.policy import heads
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import check_robot
 from mjx_balance.task.actions import action_table
@@ -41,15 +41,12 @@ def naming(subject: object) -> Iterator[None]:
 
 
 def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) -> dict[str, Any]:
-    """Makes the manifest of a policy.
+    """Returns the manifest of a policy, as JSON values.
 
     Args:
       config: of the training.
       scene_hash: fingerprint of the training's scene.
       training: provenance, e.g. decisions and seconds.
-
-    Returns:
-      JSON values.
     """
     return {
         "format": FORMAT,
@@ -88,8 +85,9 @@ def describe(config: Config, robot: Robot) -> dict[str, Any]:
 
 
 def network_factors(config: Config) -> tuple[int, ...]:
-    """Factors of the config's Q-network (`heads.network_factors`)."""
-    return heads.network_factors(config.dqn.head, (config.task.action_levels,) * ACTION_AXES)
+    """Factors of the Q-network: one for all actions (head "joint"), or one per axis."""
+    levels = (config.task.action_levels,) * ACTION_AXES
+    return (math.prod(levels),) if config.dqn.head == "joint" else levels
 
 
 def read_manifest(manifest: Any) -> tuple[Config, Robot]:

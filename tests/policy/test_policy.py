@@ -1,7 +1,6 @@
 """The exported policy: the same values as the network, no JAX, no bad file accepted."""
 
 import json
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -31,33 +30,6 @@ def path(tmp_path: Path, config: Config) -> Path:
     """A sound policy file, there to be damaged."""
     random_policy(tmp_path / "policy.safetensors", with_head(config, "factored"))
     return tmp_path / "policy.safetensors"
-
-
-def test_radial_values_by_hand(tmp_path: Path, config: Config) -> None:
-    """Q = V + alpha exp(-beta z) - kappa z, z = sqrt(delta^2 + |k (x - mu)|^2), in plain Python."""
-    path = tmp_path / "p"
-    policy = random_policy(path, with_head(config, "radial"))
-    weights = {k: v.astype(float) for k, v in safetensors.numpy.load_file(path).items()}
-    obs = np.random.default_rng(1).normal(size=34)
-    layer = obs
-    for name in ("hidden_0", "hidden_1"):
-        layer = np.maximum(weights[f"{name}/kernel"].T @ layer + weights[f"{name}/bias"], 0)
-    features = [*layer, *obs]
-    value, mu_x, mu_y = (
-        sum(f * w for f, w in zip(features, weights["head/kernel"][:, k], strict=True))
-        + weights["head/bias"][k]
-        for k in range(3)
-    )
-    alpha, beta, kappa, delta = (math.log1p(math.exp(p)) for p in weights["profile"])
-    stretch_x, stretch_y = (math.exp(s) for s in weights["stretch"])
-    got = policy.q_values(obs)
-    for i in (0, 7, 20):
-        for j in (0, 10, 19):
-            x, y = -1 + i / 10, -1 + j / 10
-            away = (stretch_x * (x - mu_x)) ** 2 + (stretch_y * (y - mu_y)) ** 2
-            z = math.sqrt(delta**2 + away)
-            expected = value + alpha * math.exp(-beta * z) - kappa * z
-            assert got[21 * i + j] == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("head", HEADS)
