@@ -16,7 +16,7 @@ from mjx_balance.dqn import DQN
 from mjx_balance.dqn.dqn import step
 from mjx_balance.dqn.mesh import AXIS
 
-ENVS, ITERATIONS = 8, 500
+ITERATIONS = 500
 
 
 @pytest.fixture(scope="module")
@@ -54,47 +54,19 @@ def test_training_ends_in_good_values(make: Callable[..., DQN]) -> None:
     assert abs(float(metrics["reward"])) < 1
 
 
-def test_observations_whose_squares_are_beyond_numbers_spoil_no_statistics(
+def test_numbers_too_great_to_be_squared_spoil_neither_statistics_nor_parameters(
     make: Callable[..., DQN],
 ) -> None:
-    dqn = make(probes.Faulty({"reset": 1e30}, 0.02))
+    """Observations and rewards of 1e30: the batches and updates that meet them are skipped."""
+    dqn = make(probes.Faulty({"reset": 1e30}, 0.01))
     state, metrics = dqn.train_program(ITERATIONS)(dqn.init(0))
     assert_learnt(dqn, state)
     assert metrics["diverged"] == 0
     assert 50 < float(state.statistics.batches) < 195, "of 200 batches, those without such a number"
-
-
-def test_rewards_too_great_to_be_squared_cost_the_updates_that_meet_them(
-    make: Callable[..., DQN],
-) -> None:
-    """One row in 200 is one batch in seven: it is skipped, and counted, and the rest learns."""
-    dqn = make(probes.Faulty({"reward": 1e30}, 0.005), whiten_steps=0)
-    state, metrics = dqn.train_program(ITERATIONS)(dqn.init(0))
-    assert_learnt(dqn, state)
     skipped = float(metrics["skipped_updates"])
-    assert 0.05 < skipped < 0.4
-    # 16 rows of each device are wanted in all, 8 of each: the second iteration is the first.
-    asked = 2 * (ITERATIONS - 1)
+    assert 0.1 < skipped < 0.5
+    asked = 2 * (ITERATIONS - 1)  # the first iteration has too few rows
     assert int(state.gradient_steps) == asked - round(skipped * 2 * ITERATIONS)
-
-
-def test_one_seed_of_several_leaves_the_others_alone(make: Callable[..., DQN]) -> None:
-    """The parameters of the second are not numbers: the first never knows."""
-    dqn = make(probes.NoisyState(), num_seeds=2)
-    program = dqn.train_program(20)
-    sound, _ = program(dqn.init(0))
-    state = dqn.init(0)
-    spoilt = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.params)
-    state, metrics = program(state._replace(params=spoilt))
-    for a, b in zip(
-        *(jax.tree.leaves(jax.device_get(learnt(s))) for s in (state, sound)), strict=True
-    ):
-        np.testing.assert_array_equal(a[0], b[0])
-    np.testing.assert_array_equal(np.isnan(metrics["loss"]), (False, True))
-    np.testing.assert_array_equal(state.gradient_steps, (38, 0))
-    np.testing.assert_allclose(metrics["skipped_updates"], (0, 0.95), rtol=1e-6)
-    for leaf in jax.tree.leaves(jax.device_get(state.opt_state)):
-        np.testing.assert_array_equal(leaf[1], 0)
 
 
 class Stepped(NamedTuple):
@@ -158,15 +130,3 @@ def test_an_env_may_report_its_own_divergence_and_need_not_end_then() -> None:
     np.testing.assert_array_equal(after[2:], 0)  # where their step led
     assert (after[:2, 0] != 0).all(), "reset"
     np.testing.assert_array_equal(after[:2, 1], 1)
-
-
-def test_all_envs_diverging_at_once_is_no_end(make: Callable[..., DQN]) -> None:
-    """Nothing is ever stored, nothing learnt, and nothing breaks."""
-    dqn = make(probes.Faulty({"reward": math.nan}, 1.0))
-    start = jax.device_get(dqn.init(0))
-    state, metrics = dqn.train_program(3)(dqn.init(0))
-    assert int(state.replay.size) == int(state.replay.position) == 0
-    assert int(state.env_steps) == 3 * ENVS
-    jax.tree.map(np.testing.assert_array_equal, start.params, jax.device_get(state.params))
-    assert metrics["diverged"] == 1
-    assert np.isnan(metrics["loss"])
