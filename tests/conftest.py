@@ -102,9 +102,9 @@ def read_video() -> Callable[[Path], tuple[float, np.ndarray]]:
         done = subprocess.run(
             [*command, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
         )
-        said = done.stderr.decode()
-        width, height = map(int, re.findall(r"Video: .*?(\d{2,})x(\d{2,})", said)[0])
+        log = done.stderr.decode()
+        width, height = map(int, re.findall(r"Video: .*?(\d{2,})x(\d{2,})", log)[0])
         frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
-        return float(re.findall(r"([\d.]+) fps", said)[0]), frames.astype(float)
+        return float(re.findall(r"([\d.]+) fps", log)[0]), frames.astype(float)
 
     return read

@@ -154,16 +154,16 @@ def test_a_table_is_published_between_its_markers(
 
 def test_calls_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is untimed stays untimed; a ratio is the median of the rounds'."""
-    common, now, made = load("common", monkeypatch), [0.0], []
+    common, now, calls_made = load("common", monkeypatch), [0.0], []
 
     def call(name: str, seconds: float) -> None:
-        made.append(name)
+        calls_made.append(name)
         now[0] += seconds
 
     monkeypatch.setattr(common, "time", types.SimpleNamespace(perf_counter=lambda: now[0]))
-    calls = {"a": lambda: call("a", 1), "b": lambda: call("b", 2 * len(made))}
+    calls = {"a": lambda: call("a", 1), "b": lambda: call("b", 2 * len(calls_made))}
     seconds = common.interleaved(calls, 3, before=lambda: call("-", 100))
-    assert [sorted(made[k : k + 4]) for k in (0, 4, 8)] == [["-", "-", "a", "b"]] * 3
+    assert [sorted(calls_made[k : k + 4]) for k in (0, 4, 8)] == [["-", "-", "a", "b"]] * 3
     assert seconds["a"] == [1, 1, 1]
     assert len(seconds["b"]) == 3
     assert common.ratio([4, 9, 1], [1, 3, 1]) == 3

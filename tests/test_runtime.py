@@ -172,10 +172,10 @@ def test_it_is_the_tasks_decision_for_any_layout_and_legs(
         memory, targets = step.pre_step(task, robot, memory, change, None, level, now)
         samples = still + rng.normal(0, (0.02, 0.02, 0.02, 0.2, 0.2, 0.2), (task.sim_steps, 6))
         for k in range(task.sim_steps):
-            told = rig.step(angles, sample[:3], sample[3:])
-            np.testing.assert_allclose(told, targets.joints[k], rtol=0, atol=ANGLES_AGREE)
+            got = rig.step(angles, sample[:3], sample[3:])
+            np.testing.assert_allclose(got, targets.joints[k], rtol=0, atol=ANGLES_AGREE)
             assert rig.controller.action == actions[-1]
-            angles, sample = told + rng.normal(0, 0.03, told.shape), samples[k]
+            angles, sample = got + rng.normal(0, 0.03, got.shape), samples[k]
         tilts = np.zeros(task.sim_steps)
         motion = step.Motion(samples, tilts, angles[None])
         memory, outcome = step.post_step(task, robot, memory, motion)
@@ -277,10 +277,10 @@ def test_what_cannot_be_makes_it_hold(
     np.testing.assert_array_equal(rig.step(**reading), last)
     assert rig.controller.state is State.HOLDING
     assert re.search(reason, rig.controller.reason)
-    said = rig.controller.reason
+    first = rig.controller.reason
     for targets in rig.steps(120):
         np.testing.assert_array_equal(targets, last)
-    assert (rig.controller.reason, rig.controller.action) == (said, action)
+    assert (rig.controller.reason, rig.controller.action) == (first, action)
 
 
 @pytest.mark.parametrize(
@@ -462,12 +462,12 @@ def test_the_file_alone_runs_the_shipped_policy(tmp_path: Path, rig: Rig) -> Non
     command = [sys.executable, "-I", "-S", "-W", "error", "-c", ALONE, str(tmp_path), numpy_at]
     run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert run.returncode == 0, run.stderr
-    strangers, said = run.stdout.splitlines()
+    strangers, output = run.stdout.splitlines()
     assert strangers == "[]"
     expected = np.empty(0)
     for k in range(120):
         expected = rig.step(rig.standing, [0.05, 0.001 * k, 0], [0.3, 0.5, 9.8])
-    state, action, *targets = said.split()
+    state, action, *targets = output.split()
     assert (state, int(action)) == ("balancing", rig.controller.action)
     np.testing.assert_array_equal(np.asarray(targets, float), expected.ravel())
 

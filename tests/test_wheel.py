@@ -21,8 +21,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "-w", str(folder)]
     subprocess.run([*command, str(REPO)], check=True)
-    (found,) = folder.iterdir()
-    return found
+    (file,) = folder.iterdir()
+    return file
 
 
 @pytest.fixture(scope="module")
@@ -37,16 +37,16 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_is_in_it(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    wanted = {"py.typed", "runtime.py", "policies/best.safetensors", "report/page.html"}
-    wanted |= {f"scenes/{name}.xml" for name in ("board", "quadruped", "scene")}
-    wanted |= {f"robots/{name}.toml" for name in shipped()}
+    expected = {"py.typed", "runtime.py", "policies/best.safetensors", "report/page.html"}
+    expected |= {f"scenes/{name}.xml" for name in ("board", "quadruped", "scene")}
+    expected |= {f"robots/{name}.toml" for name in shipped()}
     makers = set(shipped()) - {"quadruped"}
-    wanted |= {f"policies/robots/{name}.safetensors" for name in makers}
-    wanted = {f"mjx_balance/{name}" for name in wanted}
-    assert wanted <= names
+    expected |= {f"policies/robots/{name}.safetensors" for name in makers}
+    expected = {f"mjx_balance/{name}" for name in expected}
+    assert expected <= names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "docs/"))]
     policies = {name for name in names if name.startswith("mjx_balance/policies/")}
-    assert policies == {name for name in wanted if name.endswith(".safetensors")}
+    assert policies == {name for name in expected if name.endswith(".safetensors")}
     assert wheel.stat().st_size <= MOST_BYTES
 
 
@@ -76,8 +76,8 @@ def test_it_evaluates_exports_and_checks_robots_anywhere(installed: Path, tmp_pa
 
 
 def test_training_without_what_it_needs_says_so(installed: Path, tmp_path: Path) -> None:
-    said = run(installed, tmp_path, "train", "--preset", "smoke")
-    assert said.startswith("2 ")
-    assert "training needs jax, which is not installed; the extra train brings it" in said
-    assert "`pip install 'WHEEL[train]'`" in said
+    output = run(installed, tmp_path, "train", "--preset", "smoke")
+    assert output.startswith("2 ")
+    assert "training needs jax, which is not installed; the extra train brings it" in output
+    assert "`pip install 'WHEEL[train]'`" in output
     assert list(tmp_path.iterdir()) == []

@@ -178,12 +178,12 @@ def walked() -> Walked:
     )
     dqn = DQN(probes.Walk(), QNetwork((5,), (2,)), DQNSpec(config, ENVS, 96))
     program, state = dqn.train_program(1), dqn.init(0)
-    found = []
+    iterations = []
     for _ in range(12):
         before = jax.device_get(state)
         state, metrics = program(state)
-        found.append((before, jax.device_get(state), jax.device_get(metrics)))
-    return found
+        iterations.append((before, jax.device_get(state), jax.device_get(metrics)))
+    return iterations
 
 
 def newest(before: Any, after: Any) -> Any:

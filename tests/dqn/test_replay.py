@@ -59,11 +59,11 @@ def test_an_invalid_batch_changes_nothing() -> None:
         jax.tree.map(np.testing.assert_array_equal, state, after)
 
 
-@pytest.mark.parametrize(("capacity", "kept"), [(4, 4), (7, 4), (8, 8), (15, 12)])
-def test_capacity_is_rounded_down_to_whole_batches(capacity: int, kept: int) -> None:
+@pytest.mark.parametrize(("capacity", "rows_held"), [(4, 4), (7, 4), (8, 8), (15, 12)])
+def test_capacity_is_rounded_down_to_whole_batches(capacity: int, rows_held: int) -> None:
     state = filled(10, capacity)
-    assert {len(field) for field in state.data} == {kept}
-    assert sorted(state.data.action.tolist()) == list(range(41 - kept, 41))
+    assert {len(field) for field in state.data} == {rows_held}
+    assert sorted(state.data.action.tolist()) == list(range(41 - rows_held, 41))
 
 
 def test_batches_that_do_not_fit_are_refused() -> None:

@@ -79,16 +79,16 @@ def test_loss_is_the_mean_over_the_batch() -> None:
 def steps(config: DQNConfig, total: int, count: int) -> list[float]:
     """Adam's steps for a gradient that never changes: minus the learning rate."""
     optimizer = make_optimizer(config, total)
-    state, found = optimizer.init(jnp.zeros(())), []
+    state, rates = optimizer.init(jnp.zeros(())), []
     for _ in range(count):
         update, state = optimizer.update(jnp.ones(()), state)
-        found.append(float(np.asarray(update)))
-    return found
+        rates.append(float(np.asarray(update)))
+    return rates
 
 
 def test_learning_rate_is_a_cosine_from_its_start_to_its_end() -> None:
-    found = steps(CONFIG, 10, 13)
-    assert [found[k] for k in (0, 5, 10, 12)] == pytest.approx(
+    rates = steps(CONFIG, 10, 13)
+    assert [rates[k] for k in (0, 5, 10, 12)] == pytest.approx(
         [-0.1, -0.055, -0.01, -0.01], rel=1e-4
     )
     constant = dataclasses.replace(CONFIG, learning_rate_end_share=1.0)

@@ -54,30 +54,30 @@ def pattern(text: str) -> ast.AST:
     return node.value if isinstance(node, ast.Expr) else node
 
 
-def match(wanted: object, node: object, captured: Captured) -> bool:
+def match(shape: object, node: object, captured: Captured) -> bool:
     """Whether a syntax tree has the pattern's shape; fills in what capital letters stand for."""
-    if isinstance(wanted, ast.Name) and wanted.id in string.ascii_uppercase:
-        known = captured.setdefault(wanted.id, node)  # pyright: ignore
+    if isinstance(shape, ast.Name) and shape.id in string.ascii_uppercase:
+        known = captured.setdefault(shape.id, node)  # pyright: ignore
         return isinstance(node, ast.expr) and ast.dump(known) == ast.dump(node)
-    if isinstance(wanted, ast.AST):
-        fields = (name for name in wanted._fields if name not in ("ctx", "type_comment", "kind"))
-        return type(wanted) is type(node) and all(
-            match(getattr(wanted, name), getattr(node, name), captured) for name in fields
+    if isinstance(shape, ast.AST):
+        fields = (name for name in shape._fields if name not in ("ctx", "type_comment", "kind"))
+        return type(shape) is type(node) and all(
+            match(getattr(shape, name), getattr(node, name), captured) for name in fields
         )
-    if isinstance(wanted, list):
+    if isinstance(shape, list):
         return (
             isinstance(node, list)
-            and len(wanted) == len(node)
-            and all(match(a, b, captured) for a, b in zip(wanted, node, strict=True))
+            and len(shape) == len(node)
+            and all(match(a, b, captured) for a, b in zip(shape, node, strict=True))
         )
-    return type(wanted) is type(node) and wanted == node
+    return type(shape) is type(node) and shape == node
 
 
-def matches(wanted: ast.AST, tree: ast.AST) -> Iterator[tuple[ast.AST, Captured]]:
+def matches(shape: ast.AST, tree: ast.AST) -> Iterator[tuple[ast.AST, Captured]]:
     """Every node that has the pattern's shape."""
     for node in ast.walk(tree):
         captured: Captured = {}
-        if isinstance(node, (ast.expr, ast.stmt)) and match(wanted, node, captured):
+        if isinstance(node, (ast.expr, ast.stmt)) and match(shape, node, captured):
             yield node, captured
 
 
@@ -97,7 +97,7 @@ def find(bug: Bug, trees: dict[str, ast.Module]) -> Place | None:
       bug: what is to be planted.
       trees: syntax tree of each module, by dotted name.
     """
-    wanted = pattern(bug.old)
+    shape = pattern(bug.old)
     named = [
         (module, node)
         for module, tree in trees.items()
@@ -105,9 +105,9 @@ def find(bug: Bug, trees: dict[str, ast.Module]) -> Place | None:
         if f".{name}".endswith(f".{bug.function}")
     ]
     for places in (named, trees.items()):
-        found = [Place(module, *hit) for module, tree in places for hit in matches(wanted, tree)]
-        if len(found) == 1:
-            return found[0]
+        hits = [Place(module, *hit) for module, tree in places for hit in matches(shape, tree)]
+        if len(hits) == 1:
+            return hits[0]
     return None
 
 

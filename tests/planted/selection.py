@@ -76,15 +76,15 @@ def graph() -> dict[str, set[str]]:
 
 def distances(file: str) -> dict[str, int]:
     """Of all modules that a test file reaches."""
-    found, edge = {file: 0}, [file]
+    steps, edge = {file: 0}, [file]
     while edge:
         following = []
         for name in edge:
-            for other in graph()[name] - found.keys():
-                found[other] = found[name] + 1
+            for other in graph()[name] - steps.keys():
+                steps[other] = steps[name] + 1
                 following.append(other)
         edge = following
-    return found
+    return steps
 
 
 def tests_of(module: str) -> list[list[str]]:

@@ -105,7 +105,7 @@ def test_what_is_no_policy_is_not_converted(
     rewrite(old, lambda w, m: m.update({part: value}))
     out = old.parent / "new.safetensors"
     assert main(["export", str(old), "--out", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"mjx-balance: {old} cannot be used: ")
-    assert re.search(message, said)
+    error = capsys.readouterr().err
+    assert error.startswith(f"mjx-balance: {old} cannot be used: ")
+    assert re.search(message, error)
     assert not out.exists()

@@ -124,8 +124,8 @@ def test_equal_values_give_numpys_choice() -> None:
 def test_file_says_what_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "policy.onnx"
     assert main(["export", str(SHIPPED), "--out", str(file)]) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said == [
+    output = capsys.readouterr().out.splitlines()
+    assert output == [
         f"{file}: {file.stat().st_size / 1000:.1f} kB, opset 17",
         "observation (N, 136) float32 -> q_values (N, 441) float32, action (N,) int64",
     ]
@@ -178,8 +178,8 @@ def test_impossible_exports_are_refused(
     except SystemExit as stopped:  # tyro's own refusals
         code = stopped.code
     assert code == 2
-    said = capsys.readouterr()
-    assert named in said.err + said.out
+    output = capsys.readouterr()
+    assert named in output.err + output.out
     assert sorted(os.listdir(tmp_path)) == ["folder.onnx", "text"]
     assert not os.listdir(tmp_path / "folder.onnx")
     assert (tmp_path / "text").read_text() == "this is no policy"
@@ -191,8 +191,8 @@ def test_without_the_package_onnx_it_says_so(
     monkeypatch.setitem(sys.modules, "onnx", None)
     monkeypatch.delitem(sys.modules, "mjx_balance.policy.onnx")
     assert main(["export", str(SHIPPED), "--out", str(tmp_path / "p.onnx")]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("mjx-balance: export needs the package onnx (")
-    assert "; the extra onnx brings it: `pip install -e '.[onnx]'` in a checkout, or" in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert output.startswith("mjx-balance: export needs the package onnx (")
+    assert "; the extra onnx brings it: `pip install -e '.[onnx]'` in a checkout, or" in output
+    assert output.count("\n") == 1
     assert not os.listdir(tmp_path)
