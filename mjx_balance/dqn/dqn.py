@@ -496,7 +496,7 @@ def step(
     row = jnp.where(finite, jnp.arange(len(finite)), jnp.argmax(finite))
     valid = jax.lax.pmin(finite.any().astype(jnp.int32), AXIS) > 0
     metrics: dict[str, Any] = after.metrics | {"reward": after.reward}
-    diverged = jnp.where(finite, metrics.pop("diverged", jnp.zeros_like(after.done)), 1.0)
+    diverged: Any = jnp.where(finite, metrics.pop("diverged", jnp.zeros_like(after.done)), 1.0)
     means = {name: mean_where(x, finite) for name, x in metrics.items()}
     means["diverged"] = mean_where(diverged, jnp.ones_like(finite))
     after = after.replace(done=jnp.where(finite, after.done, 1.0))  # pyright: ignore

@@ -32,8 +32,9 @@ def run_runtime(path: Path) -> None:
     """Finite targets."""
     ticks = itertools.count()
     controller = Controller(path, lambda: 0.004 * next(ticks))
+    accel = np.array([0.3, 0.5, 9.8])
     for k in range(3):
-        targets = controller.step(controller.targets, [0.05, 0.001 * k, 0], [0.3, 0.5, 9.8])
+        targets = controller.step(controller.targets, np.array([0.05, 0.001 * k, 0]), accel)
         assert np.isfinite(targets).all()
 
 
@@ -188,7 +189,7 @@ def row(k: int, **changes: Any) -> Edit:
 
 CONVERTED = "`mjx-balance export OLD.safetensors --out NEW.safetensors` converts"
 LACKS_ROBOT = "its robot cannot be used: Robot is None; it must map its fields to values"
-UNFIT: list[tuple[Edit, str, str]] = [
+UNFIT: list[tuple[Any, ...]] = [
     (
         weight("head/bias", np.zeros(7, np.float32)),
         r"weight head/bias is float32 of shape \(7,\); it must be float32 of shape \(42,\)",
