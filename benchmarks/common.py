@@ -85,9 +85,8 @@ def machine() -> str:
 
 def evaluated(scene: Any, controller: Any, suite: str, scenarios: int) -> Row:
     """A controller's `summarize`d evaluation on held-out scenarios, plain MuJoCo."""
-    from mjx_balance.evaluation.rollout import run_suite
+    from mjx_balance.evaluation.rollout import run_suite, summarize
     from mjx_balance.evaluation.suites import SEEDS
-    from mjx_balance.evaluation.summary import summarize
 
     seed = SEEDS.held_out
     rollout = run_suite(scene, controller, suite, scenarios, DURATION, seed)

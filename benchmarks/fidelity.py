@@ -36,9 +36,8 @@ with quiet_imports("torch", "warp"):
 from mjx_balance.config import Config, RandomizationConfig, preset
 from mjx_balance.envs.batch import Episodes
 from mjx_balance.evaluation.controllers import Controller, View
-from mjx_balance.evaluation.rollout import policy_scene, roll_out
+from mjx_balance.evaluation.rollout import policy_scene, roll_out, summarize
 from mjx_balance.evaluation.suites import SEEDS, draw_suite
-from mjx_balance.evaluation.summary import summarize
 from mjx_balance.policy.file import load_policy, save_policy
 from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.policy.network import Policy

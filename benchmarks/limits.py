@@ -21,9 +21,8 @@ from common import DURATION, POLICY, Row
 
 from mjx_balance.config import TaskConfig, preset
 from mjx_balance.evaluation.controllers import AttitudePD, Controller, ImuPD, make_controller
-from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out, run_suite
+from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS, SUITES, draw_suite
-from mjx_balance.evaluation.summary import summarize
 from mjx_balance.policy.file import load_policy
 from mjx_balance.sim.scene import Scene, load_scene
 

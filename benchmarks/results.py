@@ -21,15 +21,13 @@ from rich.console import Console
 
 from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_controller
 from mjx_balance.evaluation.envelope import Envelope, envelope
-from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
+from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite, summarize
 from mjx_balance.evaluation.statistics import TILTS, over_seeds
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS, SUITES
-from mjx_balance.evaluation.summary import summarize
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.policy.file import load_policy
 from mjx_balance.policy.network import Policy
-from mjx_balance.report.digest import code_digest
-from mjx_balance.report.measuring import ENVELOPE_DURATION, ENVELOPE_SCENARIOS
+from mjx_balance.report.measuring import ENVELOPE_DURATION, ENVELOPE_SCENARIOS, code_digest
 from mjx_balance.report.progress import Display
 from mjx_balance.sim.scene import Scene
 

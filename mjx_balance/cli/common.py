@@ -1,7 +1,11 @@
 """Functions that several commands use."""
 
+import dataclasses
 import sys
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from mjx_balance.config import check, preset
 from mjx_balance.errors import USAGE_ERROR, InputError
@@ -41,29 +45,29 @@ def check_out(name: str, path: Path | None, suffix: str = "") -> None:
         raise InputError(f"cannot write {path}: its folder does not exist")
 
 
-def load_controller(
-    policy: Path | None, baseline: str | None, robot: str | None
-) -> tuple[Scene, Controller]:
-    """Loads a policy or builds a baseline.
+@dataclasses.dataclass(frozen=True)
+class ControllerArgs:
+    """The flags that say who balances."""
 
-    Args:
-      policy: file, run folder or name of a shipped policy.
-      baseline: name of a controller; exactly one of policy and baseline is not None.
-      robot: the baseline's robot, or the path of the policy's robot file on this machine.
+    policy: Annotated[Path | None, tyro.conf.Positional] = None
+    """Policy file, run folder, or the name of a shipped policy."""
+    controller: str | None = None
+    """Baseline instead of a policy: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
+    robot: str | None = None
+    """Robot of the baseline, or the new path of the policy's robot file."""
 
-    Returns:
-      Scene and controller.
+    def load(self) -> tuple[Scene, Controller]:
+        """Loads the policy or builds the baseline, and its scene.
 
-    Raises:
-      ControllerError: if both or neither of policy and baseline are None.
-      PolicyError: if the policy cannot be used.
-      ConfigError: if the robot does not exist.
-    """
-    if (policy is None) == (baseline is None):
-        raise ControllerError("name a policy file or --controller NAME, one of the two")
-    if policy is not None:
-        loaded = load_policy(policy)
-        return rollout.policy_scene(loaded, robot=robot), rollout.observing(loaded)
-    assert baseline is not None
-    scene = load_scene(check(for_robot(preset("default"), robot or "quadruped")))
-    return scene, make_controller(baseline, scene)
+        Raises:
+          ControllerError: if both or neither of policy and baseline are given.
+          PolicyError: if the policy cannot be used.
+          ConfigError: if the robot does not exist.
+        """
+        if (self.policy is None) == (self.controller is None):
+            raise ControllerError("name a policy file or --controller NAME, one of the two")
+        if self.policy is not None:
+            policy = load_policy(self.policy)
+            return rollout.policy_scene(policy, robot=self.robot), rollout.observing(policy)
+        scene = load_scene(check(for_robot(preset("default"), self.robot or "quadruped")))
+        return scene, make_controller(str(self.controller), scene)

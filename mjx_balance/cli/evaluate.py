@@ -2,30 +2,24 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 from rich.console import Console
 
-from mjx_balance.cli.common import check_out, complain, load_controller
+from mjx_balance.cli.common import ControllerArgs, check_out, complain
 from mjx_balance.errors import FAILED
 from mjx_balance.evaluation.controllers import Controller
 from mjx_balance.evaluation.rollout import run_suite, summarize
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.report.progress import Display
+from mjx_balance.report.tables import evaluation_table
 from mjx_balance.sim.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluateArgs:
+class EvaluateArgs(ControllerArgs):
     """Evaluate a policy in plain MuJoCo on all cores. Needs no JAX."""
 
-    policy: Annotated[Path | None, tyro.conf.Positional] = None
-    """Policy file, run folder, or the name of a shipped policy."""
-    controller: str | None = None
-    """Baseline to evaluate instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
-    robot: str | None = None
-    """Robot of the baseline, or the new path of the policy's robot file."""
     suite: str = "paper"
     """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast or
     steep."""
@@ -43,31 +37,18 @@ class EvaluateArgs:
 
 def evaluate(argv: list[str]) -> int:
     args = tyro.cli(EvaluateArgs, args=argv, prog="mjx-balance evaluate")
-    from mjx_balance.report.tables import evaluation_table
-
-    display = Display(Console(stderr=True))
     check_out("json", args.json)
     check_out("video", args.video, ".mp4")
-    scene, controller = load_controller(args.policy, args.controller, args.robot)
-    with display.bar(f"evaluating, suite {args.suite}") as bar:
-        rollout = run_suite(
-            scene,
-            controller,
-            args.suite,
-            args.scenarios,
-            args.duration,
-            args.seed,
-            bar,
-        )
+    scene, controller = args.load()
+    size = (args.scenarios, args.duration, args.seed)
+    with Display(Console(stderr=True)).bar(f"evaluating, suite {args.suite}") as bar:
+        rollout = run_suite(scene, controller, args.suite, *size, bar)
     result = summarize(rollout, args.suite, args.duration, args.seed)
     Console().print(evaluation_table({args.suite: result}))
-    speed = result["physics_steps_per_second"]
-    print(f"{speed:,.0f} physics steps per second", flush=True)
+    print(f"{result['physics_steps_per_second']:,.0f} physics steps per second", flush=True)
     if args.json:
         write_json(args.json, result)
-    if args.video:
-        return _video(scene, controller, args)
-    return 0
+    return _video(scene, controller, args) if args.video else 0
 
 
 def _video(scene: Scene, controller: Controller, args: EvaluateArgs) -> int:

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.config import Config, check, preset
-from mjx_balance.robots.catalogue import Robot
+from mjx_balance.config import check, preset
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.robots.measure import UNLIMITED
+from mjx_balance.robots.robot import Leg
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
@@ -37,19 +37,12 @@ class TiltTest(NamedTuple):
 
 
 def inspect(robot: str) -> tuple[Scene, TiltTest]:
-    """Builds a robot's scene and runs the tilt test.
-
-    Args:
-      robot: as `config.robot`.
-
-    Returns:
-      The scene and the result of the test.
+    """Builds the scene of `config.robot` and runs the tilt test.
 
     Raises:
       ConfigError: if the robot cannot be built or does not stand.
     """
-    config = check(for_robot(preset("default"), robot))
-    scene = load_scene(config)
+    scene = load_scene(check(for_robot(preset("default"), robot)))
     return scene, tilt_board(scene)
 
 
@@ -69,44 +62,40 @@ def _tilt_board(scene: Scene, ways: np.ndarray) -> TiltTest:
     model, task, robot = scene.model, scene.config.task, scene.robot
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = scene.stance.qpos, scene.stance.qvel
-    slope = math.tan(math.radians(task.max_incline))
-    rise = slope * (ways[0] * robot.each("y") - ways[1] * robot.each("x"))
-    steps = round(TILT_SECONDS / task.sim_dt)
     angle = math.radians(task.max_incline)
-    root = scene.trunk_quat[0] - 3
-    rest_pos = data.qpos[root : root + 3].copy()
+    rise = math.tan(angle) * (ways[0] * robot.each("y") - ways[1] * robot.each("x"))
+    steps, path = round(TILT_SECONDS / task.sim_dt), []
     for k in range(steps + round(REST_SECONDS / task.sim_dt)):
         share = min(1.0, (k + 1) / steps)
         data.ctrl[scene.board_ctrl] = share * angle * ways
         heights = task.body_height - share * rise
         data.ctrl[scene.leg_ctrl] = joint_angles(robot, heights) + scene.stance.leg_trim
         mujoco.mj_step(model, data)
-        if k == steps:
-            rest_pos = data.qpos[root : root + 3].copy()
+        path.append(data.qpos.copy())
+    root = scene.trunk_quat[0] - 3
+    moved = (path[-1] - path[steps])[root : root + 3]
     limits = model.actuator_forcerange[scene.leg_ctrl, 1]
     return TiltTest(
         torque_share=np.abs(data.actuator_force[scene.leg_ctrl]) / limits,
         tilt=float(body_tilt(data.qpos[scene.trunk_quat])),
-        creep=float(np.linalg.norm(data.qpos[root : root + 3] - rest_pos)) / REST_SECONDS,
-        qpos=data.qpos.copy(),
+        creep=float(np.linalg.norm(moved)) / REST_SECONDS,
+        qpos=path[-1],
     )
 
 
 def problems(scene: Scene, tilt_test: TiltTest) -> list[str]:
     """Reasons why the robot is not ready for training, one sentence each."""
-    task, sentences = scene.config.task, []
+    task, name, sentences = scene.config.task, scene.robot.name, []
+    place = f"at {task.max_incline:g} deg on both axes"
     if tilt_test.tilt > task.fail_tilt:
         sentences.append(
-            f"robot {scene.robot.name} does not hold itself level at {task.max_incline:g} deg on "
-            f"both axes: its body tilts to {tilt_test.tilt:.1f} deg, and {task.fail_tilt:g} is a "
-            "fall"
+            f"robot {name} does not hold itself level {place}: its body tilts to "
+            f"{tilt_test.tilt:.1f} deg, and {task.fail_tilt:g} is a fall"
         )
     joint, share = _most_loaded(scene, tilt_test)
     if share >= NO_TORQUE_LEFT:
-        sentences.append(
-            f"robot {scene.robot.name} has no torque left at {task.max_incline:g} deg on both "
-            f"axes: {joint!r} takes {100 * share:.0f}% of its own"
-        )
+        taken = f"{joint!r} takes {100 * share:.0f}% of its own"
+        sentences.append(f"robot {name} has no torque left {place}: {taken}")
     return sentences
 
 
@@ -118,61 +107,46 @@ def _most_loaded(scene: Scene, tilt_test: TiltTest) -> tuple[str, float]:
 
 def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
     """Describes the robot and the result of its tilt test, line by line."""
-    robot, config = scene.robot, scene.config
+    robot, task = scene.robot, scene.config.task
     low, high = robot.height_range
+    able, reach = authority(task, robot), greatest_incline(task, robot)
     return [
         f"{robot.name}: {robot.total_mass:.2f} kg, of which the trunk {robot.trunk_mass:.2f}",
-        f"stands at {_mm(config.task.body_height)}; its legs reach from {_mm(low)} to {_mm(high)}",
+        f"stands at {_mm(task.body_height)}; its legs reach from {_mm(low)} to {_mm(high)}",
         f"servos {robot.servo_stiffness:g} N m/rad, {robot.servo_damping:g} N m s/rad; limits "
         f"{_limit(robot.hip_torque)} (abduction, hip), {_limit(robot.knee_torque)} (knee)",
         "",
-        *_legs(robot),
+        *map(_leg, robot.legs),
         "",
-        *_abilities(config, robot),
-        *_standing(scene, tilt_test),
-    ]
-
-
-def _legs(robot: Robot) -> list[str]:
-    lines = []
-    for leg in robot.legs:
-        place = f"{'front' if leg.front else 'hind'} {'left' if leg.left else 'right'}"
-        ahead, side = "ahead" if leg.x > 0 else "behind", "left" if leg.y > 0 else "right"
-        turns = " ".join(
-            ("+" if sign > 0 else "-") + joint
-            for sign, joint in zip(leg.signs, leg.joints, strict=True)
-        )
-        bend = "backward" if sum(leg.knee) < 0 else "forward"
-        lines.append(
-            f"{leg.name:>4}  {place:<10}  foot {_mm(abs(leg.x))} {ahead}, {_mm(abs(leg.y))} to the "
-            f"{side}; thigh {_mm(leg.thigh)}, calf {_mm(leg.calf)}; knee {bend}; {turns}"
-        )
-    return lines
-
-
-def _abilities(config: Config, robot: Robot) -> list[str]:
-    able, reach = authority(config.task, robot), greatest_incline(config.task, robot)
-    task = config.task
-    return [
         f"height changes up to {1000 * task.action_max:.2f} mm follow {able:.2f} deg/s, "
         f"{able / task.board_rate:.2f} of the board's {task.board_rate:g}",
         f"the legs follow {reach:.1f} deg on both axes at once; the board tilts to "
         f"{task.max_incline:g}",
+        _standing(scene, tilt_test),
     ]
 
 
-def _standing(scene: Scene, tilt_test: TiltTest) -> list[str]:
+def _leg(leg: Leg) -> str:
+    place = f"{'front' if leg.front else 'hind'} {'left' if leg.left else 'right'}"
+    ahead, side = "ahead" if leg.x > 0 else "behind", "left" if leg.y > 0 else "right"
+    signs = ("+" if sign > 0 else "-" for sign in leg.signs)
+    turns = " ".join(map("".join, zip(signs, leg.joints, strict=True)))
+    bend = "backward" if sum(leg.knee) < 0 else "forward"
+    return (
+        f"{leg.name:>4}  {place:<10}  foot {_mm(abs(leg.x))} {ahead}, {_mm(abs(leg.y))} to the "
+        f"{side}; thigh {_mm(leg.thigh)}, calf {_mm(leg.calf)}; knee {bend}; {turns}"
+    )
+
+
+def _standing(scene: Scene, tilt_test: TiltTest) -> str:
     joint, share = _most_loaded(scene, tilt_test)
-    unlimited = UNLIMITED in (scene.robot.hip_torque, scene.robot.knee_torque)
     slow = tilt_test.creep < MAX_CREEP
     still = "stands still" if slow else f"slides by {1000 * tilt_test.creep:.0f} mm/s"
-    incline = scene.config.task.max_incline
     loaded = f"the most loaded servo, {joint}, takes {100 * share:.0f}% of its torque"
-    if unlimited:
+    if UNLIMITED in (scene.robot.hip_torque, scene.robot.knee_torque):
         loaded = "its model limits no torque: say hip_torque and knee_torque, in N m"
-    return [
-        f"at {incline:g} deg on both axes it {still}, level to {tilt_test.tilt:.2f} deg; {loaded}",
-    ]
+    place = f"at {scene.config.task.max_incline:g} deg on both axes"
+    return f"{place} it {still}, level to {tilt_test.tilt:.2f} deg; {loaded}"
 
 
 def _limit(torque: float) -> str:

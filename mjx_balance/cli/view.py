@@ -1,24 +1,37 @@
-"""`mjx-balance view`."""
+"""`mjx-balance view`, and the session that it shows. No JAX."""
 
+import contextlib
 import dataclasses
-from pathlib import Path
-from typing import Annotated
+import math
 
+import mujoco
+import numpy as np
 import tyro
 
-from mjx_balance.cli.common import complain, load_controller
+from mjx_balance.cli.common import ControllerArgs, complain
+from mjx_balance.envs.batch import BatchEnv, Episodes
+from mjx_balance.evaluation.controllers import Controller
+from mjx_balance.evaluation.rollout import look
+from mjx_balance.evaluation.suites import check_seed, draw_suite
+from mjx_balance.robots.limits import greatest_incline
+from mjx_balance.sim.scene import Scene
+from mjx_balance.task import tilt
+from mjx_balance.task.actions import action_table
+from mjx_balance.task.pushes import Pushes
+
+STEP = 1.0
+"""Change of the board's target by one key press, deg."""
+PUSH_SPEED = 0.4
+"""Speed that a push gives our own robot, m/s; scaled by `size_scale` for others."""
+RIGHT, LEFT, DOWN, UP, PUSH_KEY, LEVEL = 262, 263, 264, 265, 257, 268
+"""GLFW codes of the arrow keys, Enter and Home."""
+KEYS = "arrows: tilt the board\nHome: level\nEnter: push"
 
 
 @dataclasses.dataclass(frozen=True)
-class ViewArgs:
+class ViewArgs(ControllerArgs):
     """Watch a policy in MuJoCo's viewer; keys tilt the board and push the robot."""
 
-    policy: Annotated[Path | None, tyro.conf.Positional] = None
-    """Policy file, run folder, or the name of a shipped policy."""
-    controller: str | None = None
-    """Baseline to watch instead: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
-    robot: str | None = None
-    """Robot of the baseline, or the new path of the policy's robot file."""
     suite: str | None = None
     """Suite that moves the board and pushes the robot; none: keys do."""
     seed: int = 0
@@ -27,26 +40,107 @@ class ViewArgs:
 
 def view(argv: list[str]) -> int:
     args = tyro.cli(ViewArgs, args=argv, prog="mjx-balance view")
-    import mujoco
-
-    from mjx_balance.cli import viewing
     from mjx_balance.render import drawing as render
 
-    scene, controller = load_controller(args.policy, args.controller, args.robot)
-    session = viewing.Session(scene, controller, args.suite, args.seed)
+    scene, controller = args.load()
+    session = Session(scene, controller, args.suite, args.seed)
     try:
         window = render.Window(scene.config, session.press)
     except render.RenderError as error:
         return complain(f"{error}; `mjx-balance evaluate --video` needs no display")
-    corners = mujoco.mjtGridPos
-    keys = "Enter: push" if args.suite else viewing.HELP
-    try:
+    above, below = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
+    keys = "Enter: push" if args.suite else KEYS
+    with contextlib.closing(window):
         while window.is_open:
-            window.write(
-                (corners.mjGRID_TOPLEFT, *session.caption()),
-                (corners.mjGRID_BOTTOMLEFT, keys, ""),
-            )
+            window.write((above, *session.caption()), (below, keys, ""))
             window.play(session.step())
-    finally:
-        window.close()
     return 0
+
+
+class Session:
+    """A robot on a board that keys or a suite tilt, decision by decision; restarts after a fall."""
+
+    def __init__(
+        self, scene: Scene, controller: Controller, suite: str | None = None, seed: int = 0
+    ):
+        """Stands the robot on the level board.
+
+        Args:
+          scene: model, stance and task.
+          controller: chooses the actions.
+          suite: its scenarios move the board and push the robot; if None, only keys do.
+          seed: of the first scenario, and of the directions of pushes by key; each later scenario
+            adds 1.
+
+        Raises:
+          SuiteError: if the suite does not exist, or the seed is negative.
+        """
+        check_seed(seed)
+        self.scene, self.task, self.controller = scene, scene.config.task, controller
+        self.suite, self.seed = suite, seed
+        self.max_incline = greatest_incline(self.task, scene.robot)
+        self.rng = np.random.default_rng(seed)
+        self.table = action_table(self.task)
+        self.falls, self.rounds = 0, 0
+        self._start()
+
+    def _start(self) -> None:
+        if self.suite is None:
+            episodes = Episodes(self._keyed(np.zeros((2, 2)), 0))
+        else:
+            duration = self.task.episode_length * self.task.ctrl_dt
+            seed = self.seed + self.rounds
+            episodes = draw_suite(self.scene.config, self.suite, 1, duration, seed)
+        self.suite_pushes = episodes.pushes or Pushes(np.zeros((1, 0, 2)), np.zeros((1, 0), int))
+        self.env = BatchEnv(self.scene, episodes, threads=1)
+        self.obs = self.env.initial_obs
+        self.imu = np.tile(self.scene.stance.imu, (1, self.task.sim_steps, 1))
+        self.target, self.board = np.zeros(2), np.zeros(2)
+        self.push, self.number, self.tilt = np.zeros(2), 0, 0.0
+
+    def press(self, key: int) -> None:
+        """Handles a key press, a GLFW code; the camera looks from behind the robot's right."""
+        moves = {RIGHT: (1, 0), LEFT: (-1, 0), UP: (0, -1), DOWN: (0, 1)}
+        if key in moves:
+            target = self.target + STEP * np.asarray(moves[key])
+            self.target = np.clip(target, -self.max_incline, self.max_incline)
+        elif key == LEVEL:
+            self.target = np.zeros(2)
+        elif key == PUSH_KEY:
+            angle = self.rng.uniform(0, 2 * math.pi)
+            speed = PUSH_SPEED * self.scene.robot.size_scale
+            self.push = speed * np.asarray((math.cos(angle), math.sin(angle)))
+
+    def step(self) -> np.ndarray:
+        """Runs one decision; returns its states (sim_steps, nq)."""
+        env, now = self.env, self.number
+        push, self.push = self.push, np.zeros(2)  # keys arrive from another thread
+        velocity = np.append(self.suite_pushes.velocity, push[None, None], axis=1)
+        due = np.append(self.suite_pushes.due, [[now]], axis=1)
+        env.state = env.state._replace(pushes=Pushes(velocity, due))
+        if self.suite is None:
+            keyed = self._keyed(np.stack((self.board, self.target)), now)
+            env.state = env.state._replace(scenario=keyed)
+        action = self.controller(look(env, np.arange(1), now, self.obs, self.imu))
+        outcome = env.step(action if action.ndim == 2 else self.table[action])
+        self.obs, self.imu, self.number = outcome.obs, outcome.imu, now + 1
+        time = np.asarray([[self.number * self.task.ctrl_dt]])
+        self.board = tilt.board_angle(self.task, env.state.scenario, time)[0, 0]
+        self.tilt = float(outcome.tilt[0, -1])
+        over = self.suite is not None and self.number >= self.task.episode_length
+        if outcome.terminated[0] or over:
+            self.falls += bool(outcome.terminated[0])
+            self.rounds += 1
+            self._start()
+        return env.path[0]
+
+    def _keyed(self, way: np.ndarray, number: int) -> tilt.Scenario:
+        """A board that turns from `way[0]` to `way[1]`, (2, 2) deg, from decision `number` on."""
+        phase = self.task.target_period - number * self.task.ctrl_dt
+        return tilt.Scenario(way[None], np.asarray([phase]), np.asarray([self.task.board_rate]))
+
+    def caption(self) -> tuple[str, str]:
+        """Names and values to show beside the robot, one per line."""
+        roll, pitch = self.board
+        values = f"{self.tilt:.2f} deg\n{roll:+.1f}, {pitch:+.1f} deg\n{self.falls}"
+        return "body tilt\nboard\nfalls", values

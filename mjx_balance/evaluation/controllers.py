@@ -5,11 +5,9 @@ sees. The others cheat, each with more knowledge, and bound what any controller 
 with these actions at this rate.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
 from mjx_balance.config import ACTION_AXES
@@ -27,10 +25,7 @@ SWEEPS = 25
 
 
 class View(NamedTuple):
-    """What n scenarios of an evaluation show before a decision.
-
-    A policy looks at `obs` alone; baselines may look at what no robot knows.
-    """
+    """What n scenarios of an evaluation show before a decision; a policy looks at `obs` alone."""
 
     ids: np.ndarray
     """(n,) numbers of these scenarios in the batch, for controllers with a memory."""
@@ -58,8 +53,7 @@ class ControllerError(InputError):
     """An unknown controller; the message lists the known ones."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Response:
+class Response(NamedTuple):
     """What one action does to the body, measured in the simulator once."""
 
     gain: np.ndarray
@@ -89,16 +83,10 @@ def attitude(scene: Scene, view: View) -> np.ndarray:
     return np.stack(roll_pitch(view.qpos[:, scene.trunk_quat]), axis=-1)
 
 
-class Stand:
+def stand(scene: Scene) -> Controller:
     """Never moves."""
-
-    def __init__(self, scene: Scene):
-        """Needs the action set only."""
-        self.action = nearest_action(scene.config.task, np.zeros(ACTION_AXES))
-
-    def __call__(self, view: View) -> np.ndarray:
-        """Returns action indices (n,)."""
-        return np.full(len(view.ids), self.action)
+    action = nearest_action(scene.config.task, np.zeros(ACTION_AXES))
+    return lambda view: np.full(len(view.ids), action)
 
 
 class AttitudePD:
@@ -124,9 +112,8 @@ class AttitudePD:
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Roll and pitch (n, 2), deg, and their rates (n, 2), deg/s."""
-        joint = np.flatnonzero(self.scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)[0]
-        turn = self.scene.model.jnt_dofadr[joint] + 3
-        return attitude(self.scene, view), np.degrees(view.qvel[:, turn : turn + 2])
+        turn = self.scene.trunk_velocity + 3
+        return attitude(self.scene, view), np.degrees(view.qvel[:, turn])
 
 
 class ImuPD(AttitudePD):
@@ -149,7 +136,6 @@ class ImuPD(AttitudePD):
         """Takes the gains; `tau` in s, and the gyro samples averaged for the rate."""
         super().__init__(scene, proportional, rate)
         self.tau, self.samples = tau, samples
-        self.angle = np.zeros((0, ACTION_AXES))
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Filters the last decision's samples; see `AttitudePD.state`."""
@@ -188,15 +174,13 @@ class Predictive:
         response, steps = measure_response(scene), self.task.sim_steps
         self.gain = response.gain
         # effect[axis, j, t]: deg at step t per deg of action j
-        effect = np.zeros((ACTION_AXES, HORIZON, HORIZON * steps))
+        self.effect = np.zeros((ACTION_AXES, HORIZON, HORIZON * steps))
         for j in range(HORIZON):
-            effect[:, j, j * steps :] = response.course[:, : (HORIZON - j) * steps]
-        self.effect = effect
-        self.gram = np.einsum("xjt,xkt->xjk", effect, effect)
+            self.effect[:, j, j * steps :] = response.course[:, : (HORIZON - j) * steps]
+        self.gram = np.einsum("xjt,xkt->xjk", self.effect, self.effect)
         tail = np.ones_like(response.course)
         tail[:, :-steps] = response.course[:, steps:]
         self.unfinished = tail - response.course[:, steps - 1 : steps]
-        self.chosen = np.zeros((2, 0, ACTION_AXES))
 
     def __call__(self, view: View) -> np.ndarray:
         """Returns action indices (n,)."""
@@ -207,17 +191,11 @@ class Predictive:
         delayed = view.delayed[:, None]
         ahead = task.sim_dt * np.arange(1, HORIZON * task.sim_steps + 1)
         now = np.full(n, view.env_steps * task.ctrl_dt)
-        board = self.forecast(task, view.scenario, now, ahead)
+        board = self.forecast(task, view.scenario, now, ahead) @ (1, 1j)
         w, x, y, z = view.qpos[:, self.scene.trunk_quat].T
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))[:, None]
-        board = np.stack(
-            (
-                np.cos(yaw) * board[..., 0] + np.sin(yaw) * board[..., 1],
-                np.cos(yaw) * board[..., 1] - np.sin(yaw) * board[..., 0],
-            ),
-            axis=-1,
-        )
-        free = attitude(self.scene, view)[:, None] + board
+        board = board * np.exp(-1j * yaw)  # as the body sees it
+        free = attitude(self.scene, view)[:, None] + np.stack((board.real, board.imag), axis=-1)
         free = free + np.where(delayed, older, newer)[:, None] * self.unfinished.T
         linear = np.einsum("xjt,ntx->nxj", self.effect, free)
         limit = np.abs(self.gain) * task.action_max
@@ -249,7 +227,7 @@ def as_it_will_be(task, scenario: tilt.Scenario, now: np.ndarray, ahead: np.ndar
 
 
 CONTROLLERS: dict[str, Callable[[Scene], Controller]] = {
-    "none": Stand,
+    "none": stand,
     "pd-imu": ImuPD,
     "pd-attitude": AttitudePD,
     "rate-oracle": lambda scene: Predictive(scene, at_this_rate),

@@ -69,8 +69,7 @@ def envelope(
     scene = dataclasses.replace(scene, config=dataclasses.replace(scene.config, task=task))
     drawn = draw_suite(scene.config, "corner", len(cells) * scenarios, duration, seed).scenario
     incline, rate = np.repeat(np.asarray(cells), scenarios, axis=0).T
-    signs = np.sign(drawn.targets)
-    drawn = drawn._replace(targets=incline[:, None, None] * signs, rate=rate)
+    drawn = drawn._replace(targets=incline[:, None, None] * np.sign(drawn.targets), rate=rate)
     rollout = roll_out(scene, controller, Episodes(drawn), duration, progress=progress)
     shape = (len(ENVELOPE_INCLINES), len(ENVELOPE_RATES), scenarios)
     return Envelope(

@@ -1,4 +1,4 @@
-"""Controllers rolled out in plain MuJoCo on all cores. No JAX.
+"""Controllers rolled out in plain MuJoCo on all cores, and a summary of it. No JAX.
 
 The engine runs as MuJoCo ships it: C, float64, default solver accuracy. From a fall
 to the scenario's end the tilt counts as `fail_tilt`, so falling never helps; a
@@ -18,7 +18,6 @@ from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.errors import InputError
 from mjx_balance.evaluation.controllers import Controller, View
 from mjx_balance.evaluation.suites import draw_suite
-from mjx_balance.evaluation.summary import summarize
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.robots.catalogue import RobotError, find_robot
 from mjx_balance.sim.scene import Scene, load_scene
@@ -28,7 +27,8 @@ from mjx_balance.task.step import Outcome
 
 TILT_COPIES = 3
 """Arrays of every scenario's tilt at every step that a summary needs at once, float64."""
-
+SETTLED_SECONDS = 3.0
+"""End of every target's period in which the board has long been at rest, s."""
 Progress = Callable[[float], None]
 """Takes the share done."""
 
@@ -64,47 +64,6 @@ class Rollout:
         return self.fell_at < self.tilt.shape[1]
 
 
-class _Record:
-    """What is recorded of a rollout; from a fall on, the tilt counts as `fail_tilt`."""
-
-    def __init__(self, scene: Scene, count: int, decisions: int, with_qpos: bool):
-        self.task = scene.config.task
-        steps = decisions * self.task.sim_steps
-        self.tilt = np.full((count, steps), self.task.fail_tilt)
-        self.action_mm = np.full((count, decisions), np.nan)
-        self.fell_at = np.full(count, steps)
-        self.qpos = np.tile(scene.stance.qpos, (count, steps, 1)) if with_qpos else None
-
-    def add(
-        self, number: int, ids: np.ndarray, change: np.ndarray, outcome: Outcome, path: np.ndarray
-    ) -> None:
-        """Records decision `number` of scenarios `ids`.
-
-        Args:
-          number: from 0.
-          ids: (n,) scenarios whose robot stood until then.
-          change: (n, 2) a_x and a_y, m.
-          outcome: (n, ...) of the decision.
-          path: (n, sim_steps, nq) states that it passed through.
-        """
-        sim_steps = self.task.sim_steps
-        span = slice(number * sim_steps, (number + 1) * sim_steps)
-        # Where the simulation diverged, `fail_tilt` stands at every step: none is beyond it.
-        first = failed(self.task, outcome.tilt).argmax(axis=-1)
-        fallen = outcome.terminated[:, None] & (np.arange(sim_steps) >= first[:, None])
-        self.tilt[ids, span] = np.where(fallen, self.task.fail_tilt, outcome.tilt)
-        down = outcome.terminated
-        self.fell_at[ids[down]] = number * sim_steps + first[down]
-        self.action_mm[ids, number] = 1000 * np.abs(change).mean(axis=-1)
-        if self.qpos is not None:
-            self.qpos[ids, number * sim_steps :] = path[:, -1:]
-            self.qpos[ids, span] = path
-
-    def rollout(self, seconds: float) -> Rollout:
-        """The finished rollout."""
-        return Rollout(self.task, self.tilt, self.fell_at, self.action_mm, self.qpos, seconds)
-
-
 def look(env: BatchEnv, ids: np.ndarray, number: int, obs: np.ndarray, imu: np.ndarray) -> View:
     """What envs `ids` show before decision `number`; obs and imu are of their last outcome."""
     delay = np.zeros(len(ids)) if env.state.params is None else env.state.params.delay[ids]
@@ -128,7 +87,7 @@ def roll_out(
     record: bool = False,
     progress: Progress = lambda share: None,
 ) -> Rollout:
-    """Runs a controller in plain MuJoCo.
+    """Runs a controller in plain MuJoCo on n episodes.
 
     Args:
       scene: task, model and stance.
@@ -137,36 +96,100 @@ def roll_out(
       duration: s, rounded up to whole decisions.
       record: whether to record every qpos.
       progress: called with the share done.
-
-    Returns:
-      The rollout of n scenarios.
     """
     task, env = scene.config.task, BatchEnv(scene, episodes)
-    decisions = int(np.ceil(duration / task.ctrl_dt - 1e-9))
-    kept = _Record(scene, env.num_envs, decisions, record)
-    standing, obs = np.arange(env.num_envs), env.initial_obs
-    imu = np.tile(scene.stance.imu, (env.num_envs, task.sim_steps, 1))
+    count, decisions = env.num_envs, int(np.ceil(duration / task.ctrl_dt - 1e-9))
+    steps = decisions * task.sim_steps
+    rollout = Rollout(
+        task=task,
+        tilt=np.full((count, steps), task.fail_tilt),
+        fell_at=np.full(count, steps),
+        action_mm=np.full((count, decisions), np.nan),
+        qpos=np.tile(scene.stance.qpos, (count, steps, 1)) if record else None,
+        seconds=0.0,
+    )
+    ids, obs = np.arange(count), env.initial_obs
+    imu = np.tile(scene.stance.imu, (count, task.sim_steps, 1))
     table, began = action_table(task), time.perf_counter()
     for number in range(decisions):
-        action = controller(look(env, standing, number, obs, imu))
+        action = controller(look(env, ids, number, obs, imu))
         change = action if action.ndim == 2 else table[action]
-        outcome = env.step(change, standing)
-        kept.add(number, standing, change, outcome, env.path)
+        outcome = env.step(change, ids)
+        _record(rollout, number, ids, change, outcome, env.path)
         up = ~outcome.terminated
-        standing, obs, imu = standing[up], outcome.obs[up], outcome.imu[up]
+        ids, obs, imu = ids[up], outcome.obs[up], outcome.imu[up]
         progress((number + 1) / decisions)
-        if not len(standing):
+        if not len(ids):
             break
-    return kept.rollout(time.perf_counter() - began)
+    return dataclasses.replace(rollout, seconds=time.perf_counter() - began)
 
 
-def policy_scene(policy: Policy, visual: bool = False, robot: str | None = None) -> Scene:
+def _record(
+    rollout: Rollout,
+    number: int,
+    ids: np.ndarray,
+    change: np.ndarray,
+    outcome: Outcome,
+    path: np.ndarray,
+) -> None:
+    """Writes decision `number` of scenarios `ids` (n,), whose robots stood until then."""
+    task, fallen = rollout.task, outcome.terminated
+    span = slice(number * task.sim_steps, (number + 1) * task.sim_steps)
+    # Where the simulation diverged, `fail_tilt` stands at every step: none is beyond it.
+    first = failed(task, outcome.tilt).argmax(axis=-1)
+    after = fallen[:, None] & (np.arange(task.sim_steps) >= first[:, None])
+    rollout.tilt[ids, span] = np.where(after, task.fail_tilt, outcome.tilt)
+    rollout.fell_at[ids[fallen]] = span.start + first[fallen]
+    rollout.action_mm[ids, number] = 1000 * np.abs(change).mean(axis=-1)
+    if rollout.qpos is not None:
+        rollout.qpos[ids, span] = path
+        rollout.qpos[ids, span.stop :] = path[:, -1:]
+
+
+def summarize(rollout: Rollout, suite: str, duration: float, seed: int) -> dict[str, Any]:
+    """The evaluation as JSON values, tilt statistics over every physics step."""
+    tilts, falls = rollout.tilt, int(rollout.fell.sum())
+    p50, p95, p99 = np.percentile(tilts, (50, 95, 99)).tolist()
+    return {
+        "suite": suite,
+        "scenarios": len(tilts),
+        "duration_s": float(duration),
+        "seed": seed,
+        "falls": falls,
+        "fall_rate": falls / len(tilts),
+        "tilt_deg": {
+            "mean": float(tilts.mean()),
+            "rms": float(np.sqrt(np.mean(tilts**2))),
+            "p50": p50,
+            "p95": p95,
+            "p99": p99,
+            "max": float(tilts.max()),
+        },
+        "action_mm_mean": float(np.nanmean(rollout.action_mm)),
+        "action_mm_settled": settled_action(rollout),
+        "physics_steps_per_second": float(rollout.fell_at.sum() / rollout.seconds),
+    }
+
+
+def settled_action(rollout: Rollout) -> float | None:
+    """Mean commanded height change, mm per decision and axis, while the board rests.
+
+    Taken over the last `SETTLED_SECONDS` of every period of a standing robot; None if
+    there is no such decision.
+    """
+    task = rollout.task
+    until = task.target_period - np.arange(rollout.action_mm.shape[1]) * task.ctrl_dt
+    until = until % task.target_period
+    values = rollout.action_mm[:, (until > 1e-9) & (until <= SETTLED_SECONDS + 1e-9)]
+    return None if np.isnan(values).all() else float(np.nanmean(values))
+
+
+def policy_scene(policy: Policy, robot: str | None = None) -> Scene:
     """Builds the scene a policy was trained in.
 
     Args:
-      policy: says which.
-      visual: as `build_model`.
-      robot: what its robot is called here; as in training if none.
+      policy: names robot and scene.
+      robot: name of its robot here; None: as in training.
 
     Raises:
       PolicyError: if the robot is not here, is another one, or today's scene files or engine
@@ -183,7 +206,7 @@ def policy_scene(policy: Policy, visual: bool = False, robot: str | None = None)
             f"({policy.robot.total_mass:.1f} kg), and {name} is another one "
             f"({robot_here.total_mass:.1f} kg, or legs or servos that differ)"
         )
-    scene = load_scene(dataclasses.replace(policy.config, robot=name), visual)
+    scene = load_scene(dataclasses.replace(policy.config, robot=name))
     if scene.hash != policy.scene_hash:
         raise PolicyError(
             f"the policy was trained in scene {policy.scene_hash}, but scenes/ now gives "
@@ -203,9 +226,8 @@ def evaluate(
     """Evaluates a policy in plain MuJoCo; returns the JSON of `summarize`.
 
     Raises:
-      EvaluationError: if there are no scenarios or no time.
-      SuiteError: for an unknown suite.
-      PolicyError: if the policy belongs to another scene.
+      EvaluationError, SuiteError: as `run_suite`.
+      PolicyError: as `policy_scene`.
     """
     scene = policy_scene(policy)
     rollout = run_suite(scene, observing(policy), suite, scenarios, duration, seed, progress)
@@ -217,9 +239,9 @@ def check_fits(task: TaskConfig, scenarios: int, duration: float, recorded: int 
 
     Args:
       task: gives the physics step.
-      scenarios: how many.
+      scenarios: number of scenarios.
       duration: of each, s.
-      recorded: numbers recorded of every physics step besides the tilt.
+      recorded: values recorded per physics step, besides the tilt.
 
     Raises:
       EvaluationError: with the estimate.

@@ -10,14 +10,14 @@ RESAMPLES = 10_000
 TILTS = ("mean", "p95", "max")
 
 
-def interquartile_mean(values: Sequence[float]) -> float:
+def interquartile_mean(values: Sequence[float] | np.ndarray, axis: int = 0) -> Any:
     """Mean of the middle half, the robust average of Agarwal et al. 2021.
 
     https://arxiv.org/abs/2108.13264, section 4.3
     """
     from scipy import stats  # half a second that a training's start need not wait for
 
-    return float(stats.trim_mean(np.asarray(values, float), 0.25))
+    return stats.trim_mean(values, 0.25, axis=axis)
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:
@@ -27,12 +27,11 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
     """
     from scipy import stats
 
-    data = np.asarray(values, float)
-    if np.ptp(data) == 0:
-        return float(data[0]), float(data[0])
+    if min(values) == max(values):
+        return values[0], values[0]
     result = stats.bootstrap(
-        (data,),
-        lambda x, axis: stats.trim_mean(x, 0.25, axis=axis),
+        (values,),
+        interquartile_mean,
         confidence_level=CONFIDENCE,
         n_resamples=RESAMPLES,
         method="percentile",
@@ -45,24 +44,17 @@ def over_seeds(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Summarises one suite's evaluations, one per training seed.
 
     Args:
-      results: JSON of `evaluation.summarize`, one per seed.
+      results: JSON of `rollout.summarize`, one per seed.
 
     Returns:
       seeds, falls (their sum), scenarios (their sum), and for each of mean, p95 and max the
       interquartile mean, its interval, and the worst seed's value.
     """
-    summary: dict[str, Any] = {
-        "seeds": len(results),
-        "scenarios": sum(r["scenarios"] for r in results),
-        "falls": sum(r["falls"] for r in results),
-    }
+    summary: dict[str, Any] = {"seeds": len(results)}
+    summary |= {name: sum(r[name] for r in results) for name in ("scenarios", "falls")}
     for name in TILTS:
         values = [r["tilt_deg"][name] for r in results]
         low, high = interval(values)
-        summary[name] = {
-            "iqm": interquartile_mean(values),
-            "low": low,
-            "high": high,
-            "worst": max(values),
-        }
+        iqm = float(interquartile_mean(values))
+        summary[name] = {"iqm": iqm, "low": low, "high": high, "worst": max(values)}
     return summary

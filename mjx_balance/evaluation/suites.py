@@ -33,7 +33,6 @@ def _corner(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
 class Suite:
     """A kind of scenario."""
 
-    summary: str
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
     """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg."""
@@ -44,28 +43,18 @@ class Suite:
 
 
 SUITES: dict[str, Suite] = {
-    "paper": Suite("targets in any direction, up to max_incline (paper 3.1)"),
-    "corner": Suite("both axes at max_incline at once", targets=_corner),
-    "noise": Suite(
-        "IMU noise of a data sheet on every sample",
-        RandomizationConfig(gyro_noise=0.002, accel_noise=0.023),
-    ),
-    "payload": Suite("0 to 5 kg on the trunk, off its centre", RandomizationConfig(payload=5.0)),
-    "friction": Suite(
-        "foot friction from 0.4 to 1.0", RandomizationConfig(friction_min=0.4, friction_max=1.0)
-    ),
-    "gains": Suite("servo gains off by up to 20%", RandomizationConfig(gain_spread=0.2)),
-    "latency": Suite("every action one decision late", RandomizationConfig(latency_share=1.0)),
-    "push": Suite(
-        "pushes of 0.2 to 0.4 m/s in any direction, every 5 s",
-        RandomizationConfig(push_min=0.2, push_max=0.4),
-    ),
-    "fast": Suite("board speeds up to what the action set can follow", fast=True),
-    "steep": Suite("inclines up to what the legs can reach", steep=True),
+    "paper": Suite(),  # targets in any direction, up to max_incline (paper 3.1)
+    "corner": Suite(targets=_corner),  # both axes at max_incline at once
+    "noise": Suite(RandomizationConfig(gyro_noise=0.002, accel_noise=0.023)),  # of a data sheet
+    "payload": Suite(RandomizationConfig(payload=5.0)),  # 0 to 5 kg on the trunk, off its centre
+    "friction": Suite(RandomizationConfig(friction_min=0.4, friction_max=1.0)),
+    "gains": Suite(RandomizationConfig(gain_spread=0.2)),  # servo gains off by up to 20%
+    "latency": Suite(RandomizationConfig(latency_share=1.0)),  # every action one decision late
+    "push": Suite(RandomizationConfig(push_min=0.2, push_max=0.4)),  # any direction, every 5 s
+    "fast": Suite(fast=True),
+    "steep": Suite(steep=True),
 }
 """By the names of `mjx-balance evaluate --suite`."""
-
-
 HEADLINE = ("paper", "corner")
 """Suites of the figures that come first: after training, in reports and tables."""
 
@@ -116,7 +105,7 @@ def draw_suite(config: Config, suite: str, scenarios: int, duration: float, seed
     Args:
       config: robot and task.
       suite: its name.
-      scenarios: how many.
+      scenarios: number of scenarios.
       duration: of each, s.
       seed: not negative.
 

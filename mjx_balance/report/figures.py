@@ -1,10 +1,9 @@
 """Figures of metrics and rollouts. Nothing here simulates."""
 
-import functools
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -21,7 +20,7 @@ from mjx_balance.task.reward import RewardInputs, reward_terms
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-BLUE, ORANGE, GREY = "#2166ac", "#d6604d", "#777777"
+BLUE, ORANGE, GREY, GREEN = "#2166ac", "#d6604d", "#777777", "#4d9221"
 SHADES = ("#b2182b", "#ef8a62", "#7f7f7f", "#1a9850", "#91cf60")
 STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
@@ -34,20 +33,8 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "axes.titlelocation": "left",
 }
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def package_style(draw: Callable[P, R]) -> Callable[P, R]:
-    """Decorates a function so that it draws in the package's style, whatever the caller's."""
-
-    @functools.wraps(draw)
-    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        with plt.rc_context(STYLE):
-            return draw(*args, **kwargs)
-
-    return wrapper
+styled = mpl.rc_context(STYLE)
+"""Decorates a function so that it draws in the package's style, whatever the caller's."""
 
 
 def draw_figures(
@@ -57,7 +44,7 @@ def draw_figures(
     scene: Scene,
     rollouts: Mapping[str, Rollout],
 ) -> list[Path]:
-    """Draws a run's figures.
+    """Draws a run's figures; returns the files written.
 
     Args:
       folder: to write them to; created if it does not exist.
@@ -65,22 +52,19 @@ def draw_figures(
       task: defines the reward.
       scene: of the rollouts.
       rollouts: see `rollout_figure`.
-
-    Returns:
-      The files written.
     """
     folder.mkdir(exist_ok=True)
     drawings = {
-        "learning_curves.png": learning_curves([metrics]),
-        "reward.png": reward_figure(task),
-        "rollout.png": rollout_figure(scene, rollouts),
+        folder / "learning_curves.png": learning_curves([metrics]),
+        folder / "reward.png": reward_figure(task),
+        folder / "rollout.png": rollout_figure(scene, rollouts),
     }
-    for name, figure in drawings.items():
-        write_atomically(folder / name, png(figure))
-    return [folder / name for name in drawings]
+    for file, figure in drawings.items():
+        write_atomically(file, png(figure))
+    return list(drawings)
 
 
-@package_style
+@styled
 def png(figure: plt.Figure) -> bytes:
     """Returns the bytes of a PNG file of the figure, and closes the figure."""
     buffer = io.BytesIO()
@@ -102,7 +86,7 @@ HELD_OUT = {f"eval/{suite}/tilt_mean": f"held out, {suite}" for suite in HEADLIN
 """Validation metrics that the tilt panel shows as points, and their labels."""
 
 
-@package_style
+@styled
 def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
     """Tilt, falls, reward, loss, epsilon and speed over env steps.
 
@@ -126,11 +110,11 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
         if scale == "log":
             values = np.where(values > 0, values, np.nan)  # a log scale has no zero
         finite = np.isfinite(values).any(axis=0)
-        at, values = steps[finite] / 1000, values[:, finite]
+        thousands, values = steps[finite] / 1000, values[:, finite]
         if len(values) > 1:
             low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-            axis.fill_between(at, low, high, color=BLUE, alpha=0.2, lw=0)
-        axis.plot(at, np.nanmedian(values, axis=0), color=BLUE, lw=1.6)
+            axis.fill_between(thousands, low, high, color=BLUE, alpha=0.2, lw=0)
+        axis.plot(thousands, np.nanmedian(values, axis=0), color=BLUE, lw=1.6)
         axis.set_title(title)
         axis.set_yscale(scale, **({"linthresh": 0.1} if scale == "symlog" else {}))
         if name == "train/tilt_deg":
@@ -140,8 +124,7 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
             _draw_held_out(axis, runs)
         if scale in ("linear", "symlog") and name != "train/reward":
             axis.set_ylim(bottom=0)
-    for axis in axes[-1]:
-        axis.set_xlabel("thousand decisions")
+    plt.setp(axes[-1], xlabel="thousand decisions")
     return figure
 
 
@@ -167,7 +150,7 @@ def _seed_curves(run: list[dict[str, Any]], name: str) -> np.ndarray:
     return np.asarray([[m.get(name) for m in run]], float)
 
 
-@package_style
+@styled
 def reward_figure(task: TaskConfig) -> plt.Figure:
     """The reward for the tilt (paper Fig. 4) and for its change (our reading of Fig. 5)."""
     tilt = np.linspace(0, task.fail_tilt, 301)
@@ -175,18 +158,17 @@ def reward_figure(task: TaskConfig) -> plt.Figure:
     none = np.zeros_like(tilt)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
     left.plot(tilt, reward_terms(task, RewardInputs(tilt, tilt, none))["level"], color=BLUE, lw=2)
-    left.set_title("instant incline (paper Eq. 4, Fig. 4)")
-    left.set_xlabel("body tilt [deg]")
+    left.set(title="instant incline (paper Eq. 4, Fig. 4)", xlabel="body tilt [deg]")
     left.set_ylabel("reward")
     toward = reward_terms(task, RewardInputs(change, none, none))["toward"]
-    right.plot(change, np.where(toward >= 0, toward, np.nan), color="#4d9221", lw=2)
+    right.plot(change, np.where(toward >= 0, toward, np.nan), color=GREEN, lw=2)
     right.plot(change, np.where(toward <= 0, toward, np.nan), color=ORANGE, lw=2)
     right.set_title("toward horizontal (our reading of Fig. 5)")
     right.set_xlabel("tilt before less tilt after [deg]")
     return figure
 
 
-@package_style
+@styled
 def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
     """The paper's Fig. 7: board and body angles over time in plain MuJoCo.
 
@@ -194,14 +176,9 @@ def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
       scene: of the rollouts.
       rollouts: name -> rollout of one scenario with `qpos`; one column each.
     """
+    count, size = len(rollouts), (max(11, 6.5 * len(rollouts)), 7)
     figure, axes = plt.subplots(
-        4,
-        len(rollouts),
-        figsize=(max(11, 6.5 * len(rollouts)), 7),
-        sharex=True,
-        sharey=True,
-        squeeze=False,
-        layout="constrained",
+        4, count, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
     )
     for column, (name, rollout) in zip(axes.T, rollouts.items(), strict=True):
         _draw_rollout(column, scene, rollout)
@@ -211,9 +188,8 @@ def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
             + (", the robot fell" if rollout.fell[0] else "")
         )
         column[-1].set_xlabel("time [s]; dotted: the board takes a new target")
-    for axis, name in zip(
-        axes[:, 0], ("board X", "board Y", "body roll", "body pitch"), strict=True
-    ):
+    names = ("board X", "board Y", "body roll", "body pitch")
+    for axis, name in zip(axes[:, 0], names, strict=True):
         axis.set_ylabel(f"{name} [deg]")
     return figure
 
@@ -233,7 +209,7 @@ def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
             axis.axvline(change, color="black", lw=0.8, ls=":")
 
 
-@package_style
+@styled
 def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figure:
     """Share of the time in which the body tilt exceeds a value, over that value.
 
@@ -242,21 +218,19 @@ def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figu
       edges: (bins + 1,) bounds of the bins, deg.
     """
     figure, axis = plt.subplots(figsize=(9, 3.8), layout="constrained")
-    for k, (name, share) in enumerate(shares.items()):
+    for (name, share), colour in zip(shares.items(), (BLUE, *SHADES), strict=False):
         beyond = 1 - np.cumsum(share)
-        style = {"color": BLUE, "lw": 2.6} if k == 0 else {"color": SHADES[k - 1], "lw": 1.4}
-        axis.plot(edges[1:], np.where(beyond > 1e-7, beyond, np.nan), label=name, **style)
-    axis.set_yscale("log")
-    axis.set_xscale("log")
-    axis.set_xlim(0.02, edges[-1])
-    axis.xaxis.set_major_formatter("{x:g}")
-    axis.set_xlabel("body tilt [deg]")
+        width = 2.6 if colour == BLUE else 1.4
+        values = np.where(beyond > 1e-7, beyond, np.nan)
+        axis.loglog(edges[1:], values, label=name, color=colour, lw=width)
+    axis.set(xlim=(0.02, edges[-1]), xlabel="body tilt [deg]")
     axis.set_title("share of the time that the body is tilted further")
+    axis.xaxis.set_major_formatter("{x:g}")
     axis.legend(loc="lower left")
     return figure
 
 
-@package_style
+@styled
 def envelope_figure(envelope: Envelope, limit: float) -> plt.Figure:
     """Fall rate and mean tilt over incline and board speed, with the physical limits.
 
@@ -269,15 +243,13 @@ def envelope_figure(envelope: Envelope, limit: float) -> plt.Figure:
         (envelope.fall_rate, "share of the scenarios with a fall", "Reds", 1.0),
         (envelope.mean_tilt, "mean body tilt [deg]", "viridis_r", limit),
     )
+    rates, inclines = envelope.rates, envelope.inclines
     for axis, (values, title, colours, top) in zip(axes, maps, strict=True):
-        image = axis.pcolormesh(
-            envelope.rates, envelope.inclines, values, cmap=colours, vmin=0, vmax=top
-        )
+        image = axis.pcolormesh(rates, inclines, values, cmap=colours, vmin=0, vmax=top)
         figure.colorbar(image, ax=axis)
-        speeds = [envelope.rates[0], envelope.authority, envelope.authority]
-        axis.plot(speeds, [envelope.reach, envelope.reach, envelope.inclines[0]], "k--", lw=1.8)
-        axis.set_title(title)
-        axis.set_xlabel("board speed on each axis [deg/s]")
+        speeds = [rates[0], envelope.authority, envelope.authority]
+        axis.plot(speeds, [envelope.reach, envelope.reach, inclines[0]], "k--", lw=1.8)
+        axis.set(title=title, xlabel="board speed on each axis [deg/s]")
         axis.grid(visible=False)
     axes[0].set_ylabel("board angle on both axes at once [deg]")
     return figure

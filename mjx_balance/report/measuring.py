@@ -2,24 +2,25 @@
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
+import mujoco
 import numpy as np
 from annotated_types import Len
 
 from mjx_balance.config import to_dict
 from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_controller
 from mjx_balance.evaluation.envelope import Envelope, envelope
-from mjx_balance.evaluation.rollout import Rollout, observing, policy_scene, run_suite
+from mjx_balance.evaluation.rollout import Rollout, observing, policy_scene, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
-from mjx_balance.evaluation.summary import summarize
 from mjx_balance.files.run_folder import read_json
+from mjx_balance.files.sources import code
 from mjx_balance.files.validation import parse
 from mjx_balance.policy.file import Policy
-from mjx_balance.report.digest import code_digest
 from mjx_balance.report.reading import FOREIGN, Finite, ReportError, suite_results
 from mjx_balance.sim.scene import Scene
 
@@ -31,6 +32,8 @@ RECORD_SECONDS = 100.0
 VIDEO_SECONDS = 12.0
 BINS = 161
 """Of the tilt distribution."""
+NAMES = ("policy", *CONTROLLERS)
+"""Of all that is measured."""
 _Shares = dict[str, dict[str, Annotated[list[Finite], Len(BINS, BINS)]]]
 
 
@@ -44,6 +47,13 @@ class Measurements:
     """Controller -> suite -> (BINS,) share of the physics steps per bin of tilt (`edges`)."""
     envelope: Envelope
     """Of the policy."""
+
+
+def code_digest() -> str:
+    """Digest of MuJoCo's version and of the evaluation's code: other code gives other results."""
+    sources = code(Envelope.__module__)
+    parts = [mujoco.__version__, *(f"{name}:{text}" for name, text in sorted(sources.items()))]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def edges(fail_tilt: float) -> np.ndarray:
@@ -76,30 +86,23 @@ def load_or_measure(
 
 
 def parse_measurements(saved: dict[str, Any]) -> Measurements:
-    """Checks a stored result, value by value.
-
-    Args:
-      saved: JSON of `Measurements`; other keys are ignored.
+    """Checks a stored result, JSON of `Measurements`, value by value.
 
     Raises:
       ReportError: for an invalid value.
       KeyError: for a missing one.
     """
-    shares = parse(_Shares, saved["shares"], ReportError)
-    fall_map = parse(Envelope, saved["envelope"], ReportError)
-    for cells in (fall_map.fall_rate, fall_map.mean_tilt):
-        if np.shape(cells) != (len(fall_map.inclines), len(fall_map.rates)):
+    results, shares = saved["results"], parse(_Shares, saved["shares"], ReportError)
+    cells = parse(Envelope, saved["envelope"], ReportError)
+    for grid in (cells.fall_rate, cells.mean_tilt):
+        if np.shape(grid) != (len(cells.inclines), len(cells.rates)):
             raise ReportError("a grid has another shape than its inclines and rates")
-    if not all(np.isfinite(values).all() for values in dataclasses.astuple(fall_map)):
+    if not all(np.isfinite(values).all() for values in dataclasses.astuple(cells)):
         raise ReportError("the envelope holds values that are not finite")
-    names = ("policy", *CONTROLLERS)
     return Measurements(
-        results={
-            name: suite_results({suite: saved["results"][name][suite] for suite in HEADLINE})
-            for name in names
-        },
-        shares={name: {suite: shares[name][suite] for suite in HEADLINE} for name in names},
-        envelope=fall_map,
+        {name: suite_results({x: results[name][x] for x in HEADLINE}) for name in NAMES},
+        {name: {x: shares[name][x] for x in HEADLINE} for name in NAMES},
+        cells,
     )
 
 
@@ -108,23 +111,20 @@ def _measure(
 ) -> Measurements:
     results: dict[str, dict[str, Any]] = {}
     shares: dict[str, dict[str, list[float]]] = {}
-    for name in ("policy", *CONTROLLERS):
+    size, seed = (scenarios, DURATION), SEEDS.report
+    for name in NAMES:
         summaries, shares[name] = {}, {}
         for suite in HEADLINE:
             controller = _controller(name, policy, scene)
             with progress(f"{name}, suite {suite}") as bar:
-                rollout = run_suite(
-                    scene, controller, suite, scenarios, DURATION, SEEDS.report, bar
-                )
-            summaries[suite] = summarize(rollout, suite, DURATION, SEEDS.report)
+                rollout = run_suite(scene, controller, suite, *size, seed, bar)
+            summaries[suite] = summarize(rollout, suite, DURATION, seed)
             counts, _ = np.histogram(rollout.tilt, edges(policy.config.task.fail_tilt))
             shares[name][suite] = (counts / counts.sum()).tolist()
         results[name] = suite_results(summaries)
+    size = (ENVELOPE_SCENARIOS, ENVELOPE_DURATION)
     with progress("envelope") as bar:
-        fall_map = envelope(
-            scene, observing(policy), ENVELOPE_SCENARIOS, ENVELOPE_DURATION, SEEDS.report, bar
-        )
-    return Measurements(results, shares, fall_map)
+        return Measurements(results, shares, envelope(scene, observing(policy), *size, seed, bar))
 
 
 def record_rollout(
@@ -143,9 +143,8 @@ def record_rollout(
       PolicyError: if the policy belongs to another scene.
     """
     scene = policy_scene(policy)
-    return run_suite(
-        scene, _controller(controller, policy, scene), suite, 1, duration, seed, record=True
-    )
+    acting = _controller(controller, policy, scene)
+    return run_suite(scene, acting, suite, 1, duration, seed, record=True)
 
 
 def _controller(name: str, policy: Policy, scene: Scene) -> Controller:

@@ -1,7 +1,7 @@
 """Progress of a run: a live panel in a terminal, plain lines elsewhere."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from rich.console import Console, Group
@@ -23,7 +23,6 @@ from mjx_balance.evaluation.suites import HEADLINE
 
 PLAIN_INTERVAL = 5.0
 """Seconds between two plain lines."""
-
 METRICS = {
     "perf/env_steps_per_second": ("decisions/s", "{:,.0f}"),
     "train/tilt_deg": ("mean tilt", "{:.3f} deg"),
@@ -46,8 +45,6 @@ class Display:
         """Writes to `console`; to standard output if None."""
         self.console = console or Console()
         self._metrics: Mapping[str, float] = {}
-        self._progress: Progress | None = None
-        self._total = 0
 
     def say(self, message: str) -> None:
         """Prints one line."""
@@ -66,6 +63,18 @@ class Display:
         self.say(f"{name}: {time.perf_counter() - began:.1f} s")
 
     @contextmanager
+    def bar(self, name: str) -> Iterator[Callable[[float], None]]:
+        """Shows a phase; call the bar with the share that is done, 0 to 1."""
+        if not self.console.is_terminal:
+            self.say(f"{name} ...")
+            yield lambda share: None
+            return
+        columns = (SpinnerColumn(), TextColumn(escape(name)), BarColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=self.console, transient=True) as progress:
+            task = progress.add_task(name, total=1.0)
+            yield lambda share: progress.update(task, completed=share)
+
+    @contextmanager
     def training(self, done: int, total: int) -> Iterator[None]:
         """Shows the progress of training; call `update` inside.
 
@@ -73,11 +82,8 @@ class Display:
           done: decisions before this training begins.
           total: decisions at its end.
         """
-        self._total, self._last = total, time.perf_counter()
-        self._start, self._done_at_start = self._last, done
-        if not self.console.is_terminal:
-            yield
-            return
+        self._total, self._done_at_start = total, done
+        self._start = self._last = time.perf_counter()
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("training"),
@@ -89,10 +95,11 @@ class Display:
             TimeRemainingColumn(elapsed_when_finished=False),
         )
         self._task = self._progress.add_task("training", total=total, completed=done)
-        with Live(self._panel(), console=self.console, refresh_per_second=8) as live:
-            self._live = live
+        if not self.console.is_terminal:
             yield
-        self._progress = None
+            return
+        with Live(get_renderable=self._panel, console=self.console, refresh_per_second=8):
+            yield
 
     def update(self, done: int, metrics: Mapping[str, float]) -> None:
         """Shows new metrics; keeps those of the last validation until the next.
@@ -103,41 +110,36 @@ class Display:
         """
         held_out = {k: v for k, v in self._metrics.items() if k.startswith("eval/")}
         self._metrics = {**held_out, **metrics}
-        if self._progress is not None:
-            self._progress.update(self._task, completed=min(done, self._total))
-            self._live.update(self._panel())
-            return
+        self._progress.update(self._task, completed=min(done, self._total))
         now = time.perf_counter()
-        if now - self._last >= PLAIN_INTERVAL or done >= self._total:
+        due = now - self._last >= PLAIN_INTERVAL or done >= self._total
+        if due and not self.console.is_terminal:
             self._last = now
             rate = (done - self._done_at_start) / max(now - self._start, 1e-9)
             left = max(self._total - done, 0) / max(rate, 1e-9)
-            self.say(f"{done:>9,}/{self._total:,} decisions  {self._line()}  left {left:.0f} s")
-
-    @contextmanager
-    def bar(self, name: str) -> Iterator["Bar"]:
-        """Shows a phase; call the `Bar` with the share that is done."""
-        if self.console.is_terminal:
-            columns = (
-                SpinnerColumn(),
-                TextColumn(escape(name)),
-                BarColumn(),
-                TimeRemainingColumn(),
-            )
-            with Progress(*columns, console=self.console, transient=True) as progress:
-                yield Bar(progress)
-        else:
-            self.say(f"{name} ...")
-            yield Bar(None)
+            line = f"{done:>9,}/{self._total:,} decisions  {self._line()}  left {left:.0f} s"
+            self.say(line)
 
     def _line(self) -> str:
-        cells = [
+        numbers = [
             f"{label} {text.format(self._metrics[name])}"
             for name, (label, text) in METRICS.items()
             if name in self._metrics
         ]
-        validation = [f"{label} {value}" for label, value in self._validation()]
-        return "  ".join([*cells, *validation, *self._warnings()])
+        return "  ".join([*numbers, *map(" ".join, self._validation()), *self._warnings()])
+
+    def _panel(self) -> Panel:
+        cells = []
+        for name, (label, text) in METRICS.items():
+            value = text.format(self._metrics[name]) if name in self._metrics else "-"
+            cells += [f"[dim]{label}[/dim]", f"[bold]{value}[/bold]"]
+        grid = Table.grid(padding=(0, 3))
+        grid.add_row(*cells[:6])
+        grid.add_row(*cells[6:])
+        validation = [f"[dim]{x}[/dim]   [bold]{y}[/bold]" for x, y in self._validation()]
+        below = ["   ".join(validation)] if validation else []
+        below += [f"[bold red]{warning}[/bold red]" for warning in self._warnings()]
+        return Panel(Group(self._progress, grid, *below), title="mjx_balance", border_style="cyan")
 
     def _validation(self) -> list[tuple[str, str]]:
         """Label and value of each suite that has been validated."""
@@ -155,33 +157,3 @@ class Display:
             for name, (label, text) in WARNINGS.items()
             if self._metrics.get(name, 0) > 0
         ]
-
-    def _panel(self) -> Panel:
-        grid = Table.grid(padding=(0, 3))
-        for _ in range(6):
-            grid.add_column()
-        cells = []
-        for name, (label, text) in METRICS.items():
-            value = text.format(self._metrics[name]) if name in self._metrics else "-"
-            cells += [f"[dim]{label}[/dim]", f"[bold]{value}[/bold]"]
-        grid.add_row(*cells[:6])
-        grid.add_row(*cells[6:])
-        validation = [f"[dim]{x}[/dim]   [bold]{y}[/bold]" for x, y in self._validation()]
-        below = ["   ".join(validation)] if validation else []
-        below += [f"[bold red]{warning}[/bold red]" for warning in self._warnings()]
-        assert self._progress is not None
-        return Panel(Group(self._progress, grid, *below), title="mjx_balance", border_style="cyan")
-
-
-class Bar:
-    """Shows the share of a phase that is done."""
-
-    def __init__(self, progress: Progress | None):
-        """Draws in `progress`; nowhere if None."""
-        self._progress = progress
-        self._task = progress.add_task("", total=1.0) if progress else None
-
-    def __call__(self, share: float) -> None:
-        """Moves the bar to `share`, 0 to 1."""
-        if self._progress is not None and self._task is not None:
-            self._progress.update(self._task, completed=share)

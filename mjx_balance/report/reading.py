@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-from annotated_types import Ge, Le, MaxLen
+from annotated_types import Ge, Le, MaxLen, MinLen
+from pydantic import WrapValidator
 
 from mjx_balance.config import Config, read_config
 from mjx_balance.errors import InputError
@@ -57,7 +58,7 @@ def read_run(path: Path) -> Run:
     Raises:
       ReportError: if the folder does not exist or holds no part of a run.
     """
-    folder = RunFolder(path)
+    folder, run = RunFolder(path), Run(path)
     parts = (folder.config, folder.metrics, folder.policy, folder.evaluation)
     if not path.is_dir():
         raise ReportError(f"{path} is no folder; `mjx-balance train` makes one for each run")
@@ -66,7 +67,6 @@ def read_run(path: Path) -> Run:
             f"{path} is no run folder: it has none of {', '.join(file.name for file in parts)}; "
             "`mjx-balance train` makes one"
         )
-    run = Run(path)
 
     def read(file: Path, parse: Callable[[Path], Any]) -> Any:
         if not file.is_file():
@@ -96,9 +96,17 @@ def error_text(error: BaseException) -> str:
     return shorten(reason, MESSAGE) or type(error).__name__
 
 
+def _or_gap(value: Any, check: Callable[[Any], float]) -> float:
+    """NaN for a value that is not finite, as after a divergence."""
+    gap = isinstance(value, float) and not math.isfinite(value)
+    return math.nan if gap else check(value)
+
+
 LENIENT = STRICT | {"extra": "ignore"}
 Finite = Annotated[float, Ge(-GREATEST), Le(GREATEST)]
 Count = Annotated[int, Ge(0), Le(GREATEST)]
+Metric = Annotated[Finite, WrapValidator(_or_gap)]
+SeedMetric = Annotated[Metric, WrapValidator(lambda x, check: math.nan if x is None else check(x))]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +122,7 @@ class Tilt:
 
 @dataclasses.dataclass(frozen=True)
 class SuiteResult:
-    """The fields of `summary.summarize` that a report uses."""
+    """The fields of `rollout.summarize` that a report uses."""
 
     __pydantic_config__ = LENIENT
 
@@ -141,15 +149,12 @@ class _Seeds:
 @dataclasses.dataclass(frozen=True)
 class _Line:
     env_steps: Count
-    metrics: dict[str, Finite]
-    seeds: dict[str, list[Finite | None]]
+    metrics: dict[str, Metric]
+    seeds: dict[str, Annotated[list[SeedMetric], MinLen(1)]]
 
 
 def suite_results(value: Any) -> dict[str, dict[str, Any]]:
-    """Checks an evaluation.
-
-    Args:
-      value: suite -> JSON of `summary.summarize`.
+    """Checks an evaluation, suite -> JSON of `rollout.summarize`.
 
     Returns:
       Suite -> the fields of `SuiteResult`.
@@ -210,40 +215,23 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
     curves = [name for name, _, _ in CURVES]
     names = (*curves, *(name for name in HELD_OUT if name in values))
     of_seeds = (*(name.removeprefix("train/") for name in curves), *HELD_OUT)
-    line = parse(
-        _Line,
-        {
-            "env_steps": values.get("env_steps"),
-            "metrics": {x: values.get(x) for x in names if not _is_gap(values.get(x))},
-            "seeds": {x: _without_gaps(seeds[x]) for x in of_seeds if x in seeds},
-        },
-        ReportError,
-    )
+    parts = {
+        "env_steps": values.get("env_steps"),
+        "metrics": {name: values.get(name) for name in names},
+        "seeds": {name: seeds[name] for name in of_seeds if name in seeds},
+    }
+    line = parse(_Line, parts, ReportError)
     if before and line.env_steps <= before[-1]["env_steps"]:
         raise ReportError(f"env_steps is {line.env_steps}; it must be more than in the line before")
-    metrics = {name: line.metrics.get(name, math.nan) for name in names}
-    found: dict[str, Any] = {"env_steps": line.env_steps, **metrics}
+    result = {"env_steps": line.env_steps, **line.metrics}
     if seeds:
-        found["seeds"] = {
-            name: [math.nan if x is None else x for x in row] for name, row in line.seeds.items()
-        }
-    if 0 in _counts(found).values():
-        raise ReportError("it holds no seed")
-    if before and _counts(found) != _counts(before[0]):
+        result["seeds"] = line.seeds
+    if before and _counts(result) != _counts(before[0]):
         raise ReportError("other seeds than in line 1")
-    return found
+    return result
 
 
 def _counts(line: dict[str, Any]) -> dict[str, int]:
     """Number of seeds of each training metric; validations are not in every line."""
     seeds = line.get("seeds", {})
     return {name: len(values) for name, values in seeds.items() if name not in HELD_OUT}
-
-
-def _is_gap(value: Any) -> bool:
-    """Whether a value is NaN or infinite, as after a divergence."""
-    return isinstance(value, float) and not math.isfinite(value)
-
-
-def _without_gaps(row: Any) -> Any:
-    return [None if _is_gap(x) else x for x in row] if isinstance(row, list) else row

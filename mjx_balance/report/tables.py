@@ -1,5 +1,6 @@
 """Tables for a terminal of 80 columns."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,10 @@ def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
     """One row per suite.
 
     Args:
-      results: suite -> JSON of `summary.summarize`.
+      results: suite -> JSON of `rollout.summarize`.
     """
-    table = _suites_table("plain MuJoCo, tilt in deg over every physics step")
-    for name in ("scenarios", "falls", *STATISTICS, "act mm"):
-        table.add_column(name, justify="right", no_wrap=True)
+    names = ("scenarios", "falls", *STATISTICS, "act mm")
+    table = _table("plain MuJoCo, tilt in deg over every physics step", names, suites=True)
     for suite, result in results.items():
         table.add_row(
             suite,
@@ -42,17 +42,12 @@ def sweep_table(ranked: list[dict[str, Any]]) -> Table:
       ranked: combinations, best first, each with `values`, name -> value, and `statistics`,
         suite -> `statistics.over_seeds`.
     """
-    names = list(ranked[0]["values"])
-    table = _narrow("sweep, best first: falls, mean tilt in deg (95% interval over seeds)")
-    for name in (*names, "seeds"):
-        table.add_column(name, justify="right", no_wrap=True)
-    suites = list(ranked[0]["statistics"])
-    for suite in suites:
-        table.add_column(suite, justify="right", no_wrap=True)
+    title = "sweep, best first: falls, mean tilt in deg (95% interval over seeds)"
+    table = _table(title, [*ranked[0]["values"], "seeds", *ranked[0]["statistics"]])
     for row in ranked:
-        statistics = [row["statistics"][suite] for suite in suites]
+        statistics = list(row["statistics"].values())
         table.add_row(
-            *(f"{row['values'][name]:g}" for name in names),
+            *(f"{value:g}" for value in row["values"].values()),
             str(statistics[0]["seeds"]),
             *(f"{x['falls']}  {spread(x['mean'])}" for x in statistics),
         )
@@ -66,9 +61,8 @@ def seeds_table(summary: dict[str, dict[str, Any]]) -> Table:
       summary: suite -> `statistics.over_seeds`.
     """
     seeds = max(row["seeds"] for row in summary.values())
-    table = _suites_table(f"{seeds} seeds: interquartile mean, 95% bootstrap interval, tilt in deg")
-    for name in ("falls", *TILTS):
-        table.add_column(name, justify="right", no_wrap=True)
+    title = f"{seeds} seeds: interquartile mean, 95% bootstrap interval, tilt in deg"
+    table = _table(title, ("falls", *TILTS), suites=True)
     for suite, row in summary.items():
         table.add_row(suite, str(row["falls"]), *(spread(row[name]) for name in TILTS))
     return table
@@ -82,14 +76,7 @@ def spread(value: dict[str, float]) -> str:
 def print_summary(
     console: Console, run_dir: Path, results: dict[str, dict[str, Any]], seconds: float
 ) -> None:
-    """Prints a run's results and the paths of its files.
-
-    Args:
-      console: to print to.
-      run_dir: folder of the run.
-      results: suite -> JSON of `summary.summarize`.
-      seconds: time that the run took.
-    """
+    """Prints a run's results, JSON of `summarize` by suite, its files and the seconds it took."""
     folder = RunFolder(run_dir)
     console.print(evaluation_table(results))
     for path, what in (
@@ -106,13 +93,12 @@ def print_summary(
     console.print(f"done in {seconds:.0f} s", highlight=False)
 
 
-def _suites_table(title: str) -> Table:
-    table = _narrow(title)
-    table.add_column("suite", style="bold", no_wrap=True)
+def _table(title: str, names: Iterable[str], suites: bool = False) -> Table:
+    """A table of numbers; `suites`: its first column names the suite of a row."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.pad_edge = False
+    if suites:
+        table.add_column("suite", style="bold", no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
     return table
-
-
-def _narrow(title: str) -> Table:
-    return Table(
-        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
-    )

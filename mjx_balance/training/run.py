@@ -80,7 +80,7 @@ def train(
       profile: whether to trace a call of the training program and sum it up.
 
     Returns:
-      The evaluation, suite name -> JSON of `evaluation.summarize`; None where another process
+      The evaluation, suite name -> JSON of `rollout.summarize`; None where another process
       makes it.
 
     Raises:

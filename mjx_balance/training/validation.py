@@ -16,9 +16,8 @@ import numpy as np
 from mjx_balance.config import Config, expand_runs
 from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.dqn.dqn import Params
-from mjx_balance.evaluation.rollout import observing, run_suite
+from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
-from mjx_balance.evaluation.summary import summarize
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.policy.file import flat_weights, load_policy, save_policy
 from mjx_balance.policy.manifest import PolicyError, make_manifest
@@ -28,7 +27,7 @@ from mjx_balance.training.loop import number
 from mjx_balance.training.program_cache import LogFn
 
 Results = dict[str, dict[str, Any]]
-"""Suite name -> JSON of `evaluation.summarize`."""
+"""Suite name -> JSON of `rollout.summarize`."""
 
 
 def score(results: Results) -> tuple[int, float]:

@@ -4,21 +4,21 @@ import dataclasses
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from mjx_balance.cli import evaluate, main
-from mjx_balance.cli.common import load_controller
+from mjx_balance.cli.common import ControllerArgs
 from mjx_balance.config import ConfigError, preset, to_dict
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.evaluation.controllers import make_controller
-from mjx_balance.evaluation.rollout import observing, run_suite
-from mjx_balance.evaluation.summary import summarize
-from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked
-from mjx_balance.policy.file import PolicyError, load_policy
+from mjx_balance.evaluation.rollout import run_suite, summarize
+from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked, write_json
+from mjx_balance.policy.file import PolicyError
 from mjx_balance.render.drawing import VIDEO_SIZE
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.scene import load_scene, scene_dir
@@ -34,69 +34,44 @@ def _in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Runs a command that must be refused; returns what it said."""
+    """Runs a command that must be refused; returns what it says, in one line."""
     try:
         code = main(arguments)
     except SystemExit as stopped:  # tyro's own refusals
         code = stopped.code
     assert code == 2
     said = capsys.readouterr()
-    return said.err + said.out
+    return " ".join((said.err + said.out).split())
 
 
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (("--preset", "huge"), "unknown preset 'huge'; known presets: paper, default, best"),
-        (("--warp-speed", "9"), "--warp-speed"),
-        (("--gamma", "much"), "--gamma"),
-        (("--gamma", "1.5"), "gamma is 1.5"),
-        (("--target-period", "3"), "target_period is 3.0 s"),
-        (("--ctrl-dt", "0"), "ctrl_dt is 0.0"),
-        (("--ctrl-dt", "0.0101"), "ctrl_dt is 0.0101 s; it must be a whole multiple"),
-        (("--max-incline", "12"), "max_incline is 12.0 deg"),
-        (("--num-envs", "0"), "num_envs is 0"),
-        (("--num-seeds", "0"), "num_seeds is 0"),
-        (
-            ("--num-seeds", "100000", "--num-envs", "64"),
-            "100000 runs with num_envs 64 and replay_capacity",
-        ),
-        (("--replay-capacity", "4000000000"), "replay_capacity 4000000000 take about"),
-        (("--seed", "4294967296"), "seed is 4294967296"),
-        (("--reward-tilt", "sideways"), "--reward-tilt"),
-        (("--payload", "-1"), "payload is -1.0"),
-        (("--preset", "paper", "--num-envs", "63", "--num-devices", "2"), "num_envs is 63"),
-        (("--robot", "rex"), "robot is 'rex'; known robots: aliengo, b2"),
-        (("--robot", "rex.toml"), "no robot file at rex.toml"),
-        (("--num-envs", "64", "--num-devices", "8"), "num_devices is 8"),
-        (("--eval-scenarios", "100000000"), "eval_scenarios is 100000000 and duration 60 s: that"),
-        (("--learning-rate", "nan"), "learning_rate is nan"),
-        (("--resume", "nowhere"), "nowhere is no run folder"),
+        ("--preset huge", "unknown preset 'huge'; known presets: paper, default, best"),
+        ("--warp-speed 9", "--warp-speed"),
+        ("--gamma much", "--gamma"),
+        ("--gamma 1.5", "gamma is 1.5"),
+        ("--target-period 3", "target_period is 3.0 s"),
+        ("--max-incline 12", "max_incline is 12.0 deg"),
+        ("--num-seeds 100000 --num-envs 64", "100000 runs with num_envs 64 and replay_capacity"),
+        ("--replay-capacity 4000000000", "replay_capacity 4000000000 take about"),
+        ("--reward-tilt sideways", "--reward-tilt"),
+        ("--preset paper --num-envs 63 --num-devices 2", "num_envs is 63"),
+        ("--robot rex", "robot is 'rex'; known robots: aliengo, b2"),
+        ("--robot rex.toml", "no robot file at rex.toml"),
+        ("--num-envs 64 --num-devices 8", "num_devices is 8"),
+        ("--eval-scenarios 100000000", "eval_scenarios is 100000000 and duration 60 s: that"),
+        ("--preset smoke --run-dir text", "run folder text exists"),
+        ("--preset smoke --run-dir text/run", "run folder text/run cannot be written"),
+        ("--resume nowhere", "nowhere is no run folder"),
     ],
 )
 def test_impossible_training_is_refused(
-    capsys: pytest.CaptureFixture[str], flags: tuple[str, ...], named: str, tmp_path: Path
+    capsys: pytest.CaptureFixture[str], flags: str, named: str, tmp_path: Path
 ) -> None:
-    assert named in " ".join(refuse(capsys, "train", *flags).split())
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_run_folder_is_left_alone(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.txt").write_text("precious")
-    said = refuse(capsys, "train", "--preset", "smoke", "--run-dir", "mine")
-    assert "run folder mine exists" in said
-    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
-
-
-def test_an_unwritable_run_folder_is_said(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "file").write_text("")
-    said = refuse(capsys, "train", "--preset", "smoke", "--run-dir", "file/run")
-    assert "run folder file/run cannot be written" in said
+    (tmp_path / "text").write_text("precious")
+    assert named in refuse(capsys, "train", *flags.split())
+    assert [(x.name, x.read_text()) for x in tmp_path.iterdir()] == [("text", "precious")]
 
 
 @pytest.mark.parametrize(
@@ -106,11 +81,7 @@ def test_an_unwritable_run_folder_is_said(
         (RunFolderError("it is finished"), 2, "mjx-balance: it is finished"),
         (CheckpointError("none is whole"), 2, "mjx-balance: none is whole"),
         (PolicyError("no finite numbers"), 1, "mjx-balance: no finite numbers"),
-        (
-            OSError(28, "No space left on device", "runs/a"),
-            1,
-            "mjx-balance: cannot write runs/a: No space left on device",
-        ),
+        (OSError(28, "No room", "runs/a"), 1, "mjx-balance: cannot write runs/a: No room"),
         (run.Interrupted("go on with --resume x"), 130, "go on with --resume x"),
         (KeyboardInterrupt(), 130, ""),
     ],
@@ -123,10 +94,7 @@ def test_no_training_ends_in_a_traceback(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def train(*given: object) -> None:
-        raise error
-
-    monkeypatch.setattr(run, "train", train)
+    monkeypatch.setattr(run, "train", mock.Mock(side_effect=error))
     assert main(["train", "--preset", "smoke"]) == code
     shown = capsys.readouterr()
     assert " ".join((shown.out + shown.err).split()) == said
@@ -147,93 +115,87 @@ def test_flags_start_from_the_preset_or_from_the_resumed_run(
     create_run_folder(tmp_path / "run", to_dict(saved), {})
     assert main(["train", "--resume", "run"]) == 0
     assert given[2] == (saved, None, Path("run"))
-    assert main(["train", "--resume", "run", "--run-dir", "b"]) == 2
 
 
-def test_resuming_with_another_config_is_refused(
+SMOKE = dataclasses.replace(preset("smoke"), num_devices=1)
+
+
+def test_what_cannot_be_resumed_is_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    folder = tmp_path / "run"
-    create_run_folder(folder, to_dict(dataclasses.replace(preset("smoke"), num_devices=1)), {})
-    said = refuse(capsys, "train", "--resume", "run", "--gamma", "0.9")
-    assert "run was started with gamma = 0.1, not 0.9" in said
-    said = refuse(capsys, "train", "--resume", "run", "--preset", "paper")
-    assert "run was started with preset = smoke, not paper" in said
-    assert sorted(os.listdir(folder)) == ["config.json", "provenance.json"]
-
-
-def test_resuming_in_another_scene_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    provenance = {"scene_hash": "of another scene", "versions": {}}
-    create_run_folder(
-        tmp_path / "run", to_dict(dataclasses.replace(preset("smoke"), num_devices=1)), provenance
-    )
-    said = " ".join(refuse(capsys, "train", "--resume", "run").split())
-    today = load_scene(preset("smoke")).hash
-    assert f"run was started with scene_hash of another scene, but it is {today} today" in said
-
-
-def test_resuming_a_run_at_work_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    config = dataclasses.replace(preset("smoke"), num_devices=1)
-    today = run.provenance(BalanceEnv(config))
-    folder = create_run_folder(tmp_path / "run", to_dict(config), today)
+    folder = create_run_folder(tmp_path / "run", to_dict(SMOKE), {"versions": {}})
+    for flags, named in (
+        ("--gamma 0.9", "run was started with gamma = 0.1, not 0.9"),
+        ("--preset paper", "run was started with preset = smoke, not paper"),
+        ("--run-dir b", "--resume continues a folder in place"),
+        ("", f"started with scene_hash None, but it is {load_scene(SMOKE).hash} today"),
+    ):
+        assert named in refuse(capsys, "train", "--resume", "run", *flags.split())
+    assert sorted(os.listdir(folder.path)) == ["config.json", "provenance.json"]
+    write_json(folder.provenance, run.provenance(BalanceEnv(SMOKE)))
     with locked(folder):
-        said = " ".join(refuse(capsys, "train", "--resume", "run").split())
+        said = refuse(capsys, "train", "--resume", "run")
     assert "another process works on the run in run;" in said
-
-
-def test_resuming_a_finished_run_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "config.json").write_text(json.dumps(to_dict(preset("smoke"))))
-    (tmp_path / "evaluation.json").write_text("{}")
-    assert "is finished" in refuse(capsys, "train", "--resume", str(tmp_path))
+    folder.evaluation.write_text("{}")
+    assert "is finished" in refuse(capsys, "train", "--resume", "run")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "named"),
+    ("command", "named"),
     [
-        (("fly",), "unknown command 'fly'; known commands: train, sweep, evaluate, report"),
-        (("sweep",), "say what to try, as gamma=0.1,0.4, or @FILE with such entries, before"),
-        (("sweep", "--seed", "1"), "say what to try, as gamma=0.1,0.4"),
-        (("sweep", "@nowhere"), "the values in nowhere cannot be read"),
-        (("sweep", "@text"), "sweep is 'this'; it must name one of learning_rate"),
-        (("sweep", "gamma=0.1", "tau=1", "--preset", "smoke"), "sweep is 'tau=1'; it must name"),
-        (("evaluate", "none.safetensors"), "no policy file at none.safetensors"),
-        (("evaluate", "."), "no policy file at .; "),
-        (("evaluate", "text"), "text is damaged or no safetensors file"),
-        (("evaluate",), "name a policy file or --controller NAME"),
-        (("evaluate", "text", "--controller", "none"), "name a policy file or --controller NAME"),
-        (("evaluate", "--controller", "lqr"), "unknown controller 'lqr'; known controllers: none"),
-        (
-            ("evaluate", "--controller", "none", "--suite", "moon"),
-            "unknown suite 'moon'; known suites: paper, corner, noise",
-        ),
-        (("report",), "name at least one run folder"),
-        (("report", "."), ". is no run folder: it has none of config.json"),
-        (("report", "nowhere"), "nowhere is no folder"),
-        (("evaluate", "text", "--json", "no/such/out.json"), "cannot write no/such/out.json"),
-        (("evaluate", "--controller", "none", "--json", "."), "cannot write .: it is a folder"),
-        (("report", ".", "--out", "no/such.html"), "cannot write no/such.html: its folder does"),
-        (("evaluate", "--controller", "none", "--video", "text"), "video is text; its name must"),
-        (("evaluate", "--controller", "none", "--seed", "-1"), "seed is -1"),
-        (("evaluate", "--controller", "none", "--scenarios", "0"), "scenarios is 0"),
-        (
-            ("evaluate", "--controller", "none", "--scenarios", "100000000"),
-            "scenarios is 100000000 and duration 60 s: that takes about",
-        ),
-        (("evaluate", "--controller", "none", "--duration", "1e12"), "duration 1e+12 s: that"),
+        ("fly", "unknown command 'fly'; known commands: train, sweep, evaluate, report"),
+        ("sweep", "say what to try, as gamma=0.1,0.4, or @FILE with such entries, before"),
+        ("sweep --seed 1", "say what to try, as gamma=0.1,0.4"),
+        ("sweep @nowhere", "the values in nowhere cannot be read"),
+        ("sweep @text", "sweep is 'this'; it must name one of learning_rate"),
+        ("sweep gamma=0.1 tau=1 --preset smoke", "sweep is 'tau=1'; it must name"),
+        ("evaluate none.safetensors", "no policy file at none.safetensors"),
+        ("evaluate .", "no policy file at .; "),
+        ("evaluate text", "text is damaged or no safetensors file"),
+        ("evaluate", "name a policy file or --controller NAME"),
+        ("evaluate text --controller none", "name a policy file or --controller NAME"),
+        ("evaluate --controller lqr", "unknown controller 'lqr'; known controllers: none"),
+        ("evaluate --controller none --suite moon", "unknown suite 'moon'; known suites: paper"),
+        ("evaluate text --json no/such/out.json", "cannot write no/such/out.json"),
+        ("evaluate --controller none --json .", "cannot write .: it is a folder"),
+        ("evaluate --controller none --video text", "video is text; its name must"),
+        ("evaluate --controller none --seed -1", "seed is -1"),
+        ("evaluate --controller none --scenarios 0", "scenarios is 0"),
+        ("evaluate --controller none --duration 1e12", "duration 1e+12 s: that takes about"),
+        ("evaluate --controller pd-imu --robot rex", "robot is 'rex'"),
+        ("report", "name at least one run folder"),
+        ("report .", ". is no run folder: it has none of config.json"),
+        ("report nowhere", "nowhere is no folder"),
+        ("report . --out no/such.html", "cannot write no/such.html: its folder does"),
+        ("robot", "Expected one of {check, new}"),
+        ("robot buy", "Available subcommands: check, new"),
+        ("robot check none.toml", "no robot file at none.toml"),
+        ("robot check none.toml --picture no/such.png", "cannot write no/such.png: its folder"),
+        ("robot check none.toml --picture rex.jpg", "is rex.jpg; its name must end in .png"),
+        ("robot new none.xml", "there is no file none.xml"),
+        ("robot new menagerie:rex", "menagerie:rex cannot be had"),
+        ("robot new text", "text cannot be read"),
+        ("robot new scenes:quadruped.xml --out text", "text exists already"),
+        ("robot new scenes:quadruped.xml --out gone/rex.toml", "cannot write gone/rex.toml"),
+        ("view", "name a policy file or --controller NAME"),
+        ("view nobody", "no policy file at nobody; `mjx-balance train` writes one, and best"),
+        ("view best --suite sea", "unknown suite 'sea'"),
+        ("view best --seed -1", "seed is -1; it must not be negative"),
+        ("view best", "); `mjx-balance evaluate --video` needs no display"),
     ],
 )
 def test_impossible_commands_are_refused(
-    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], named: str, tmp_path: Path
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    named: str,
+    tmp_path: Path,
 ) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     (tmp_path / "text").write_text("this is no policy")
-    assert named in refuse(capsys, *arguments)
-    assert (tmp_path / "text").read_text() == "this is no policy"
+    assert named in refuse(capsys, *command.split())
+    assert [(x.name, x.read_text()) for x in tmp_path.iterdir()] == [("text", "this is no policy")]
 
 
 @pytest.mark.parametrize("who", ["controller", pytest.param("policy", marks=pytest.mark.slow)])
@@ -241,17 +203,13 @@ def test_evaluate_writes_figures_and_a_video(
     who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, read_video: Any
 ) -> None:
     """0.4 s of a baseline and of a policy, to the end of the command."""
+    args = {"controller": "pd-imu"} if who == "controller" else {"policy": SHIPPED}
     names = ("--controller", "pd-imu") if who == "controller" else (str(SHIPPED),)
     flags = "--suite corner --scenarios 2 --duration 0.4 --seed 5 --json out.json --video v.mp4"
     code = main(("evaluate", *names, *flags.split()))
     said = capsys.readouterr()
     result = json.loads((tmp_path / "out.json").read_text())
-    config = preset("default") if who == "controller" else load_policy(SHIPPED).config
-    scene = load_scene(config)
-    chosen = (
-        make_controller("pd-imu", scene) if who == "controller" else observing(load_policy(SHIPPED))
-    )
-    rollout = run_suite(scene, chosen, "corner", 2, 0.4, 5)
+    rollout = run_suite(*ControllerArgs(**args).load(), "corner", 2, 0.4, 5)
     expected = summarize(rollout, "corner", 0.4, 5)
     speeds = [found.pop("physics_steps_per_second") for found in (result, expected)]
     assert result == expected
@@ -292,7 +250,7 @@ def test_an_evaluation_is_of_what_was_asked_for(
 
 def test_a_baseline_stands_on_the_robot_asked_for_as_high_as_it_should() -> None:
     for name in (None, "b2"):
-        scene, _ = load_controller(None, "none", name)
+        scene, _ = ControllerArgs(controller="none", robot=name).load()
         robot = find_robot(name or "quadruped")
         assert (scene.robot, scene.config.task.body_height) == (robot, robot.body_height)
 
@@ -311,16 +269,18 @@ def test_help_is_no_error(
     assert said.out.startswith("usage: mjx-balance ")
 
 
-def full(number: int) -> None:
-    """Stands for `os.fsync` on a disk without room."""
-    raise OSError(28, "No space left on device")
+@pytest.fixture
+def full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk without room."""
+    error = OSError(28, "No space left on device")
+    monkeypatch.setattr(os, "fsync", mock.Mock(side_effect=error))
 
 
+@pytest.mark.usefixtures("full_disk")
 def test_a_full_disk_does_not_lose_the_table(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     (tmp_path / "out.json").write_text("older")
-    monkeypatch.setattr(os, "fsync", full)
     flags = "--controller none --scenarios 1 --duration 0.2 --json out.json"
     assert main(("evaluate", *flags.split())) == 2
     said = capsys.readouterr()
@@ -329,89 +289,36 @@ def test_a_full_disk_does_not_lose_the_table(
     assert [(x.name, x.read_text()) for x in tmp_path.iterdir()] == [("out.json", "older")]
 
 
+@pytest.mark.usefixtures("full_disk")
 def test_a_full_disk_leaves_no_half_robot(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(os, "fsync", full)
-    assert main(("robot", "new", "scenes:quadruped.xml", "--out", "rex.toml")) == 2
-    assert "cannot write rex.toml: No space left on device" in capsys.readouterr().err
+    said = refuse(capsys, "robot", "new", "scenes:quadruped.xml", "--out", "rex.toml")
+    assert "cannot write rex.toml: No space left on device" in said
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
-def test_a_robots_draft_can_be_checked_and_trained(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """`robot new`, `robot check`, and the flag that a user then gives to `train`."""
-    monkeypatch.chdir(tmp_path)
+def test_a_robots_draft_can_be_checked(capsys: pytest.CaptureFixture[str]) -> None:
+    """With too weak a knee it stands on the level board, and is drawn on the tilted one."""
     shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
     assert main(["robot", "new", "model.xml", "--out", "rex.toml"]) == 0
     assert "mjx-balance robot check rex.toml" in capsys.readouterr().out
-    assert 'model = "model.xml"' in Path("rex.toml").read_text()
+    text = Path("rex.toml").read_text()
+    assert 'model = "model.xml"' in text
     assert main(["robot", "check", "rex.toml", "--picture", "rex.png"]) == 0
     said = capsys.readouterr().out
     assert "rex: 15.20 kg" in said
     assert said.endswith("picture: rex.png\n")
     assert Path("rex.png").stat().st_size > 50_000
-    assert main(["robot", "check", "rex.toml"]) == 0
-    assert capsys.readouterr().out.endswith("picture: rex-check.png\n")
     assert main(["robot", "new", "model.xml"]) == 0
-    assert capsys.readouterr().out == Path("rex.toml").read_text()
-
-
-@pytest.mark.slow
-def test_a_robot_that_does_not_hold_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It stands on the level board, and is drawn where it ends on the tilted one."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
-    assert main(["robot", "new", "model.xml", "--out", "rex.toml"]) == 0
-    text = Path("rex.toml").read_text()
+    assert capsys.readouterr().out == text
     Path("rex.toml").write_text(text.replace("trunk =", "knee_torque = 5.6\ntrunk =", 1))
-    capsys.readouterr()
     assert main(["robot", "check", "rex.toml"]) == 1
     said = capsys.readouterr()
     assert "mjx-balance: robot rex has no torque left at 7 deg" in said.err
     assert "_knee' takes 100% of its own" in said.err
     assert said.out.endswith("picture: rex-check.png\n")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (("robot",), "say robot check FILE.toml, or robot new MODEL.xml"),
-        (("robot", "buy"), "say robot check FILE.toml"),
-        (("robot", "check", "none.toml"), "no robot file at none.toml"),
-        (
-            ("robot", "check", "none.toml", "--picture", "no/such.png"),
-            "cannot write no/such.png: its folder does not exist",
-        ),
-        (
-            ("robot", "check", "none.toml", "--picture", "rex.jpg"),
-            "picture is rex.jpg; its name must end in .png",
-        ),
-        (("robot", "new", "none.xml"), "there is no file none.xml"),
-        (("robot", "new", "menagerie:rex"), "menagerie:rex cannot be had"),
-        (("robot", "new", "rex.toml"), "rex.toml cannot be read"),
-        (("robot", "new", "model.xml", "--out", "rex.toml"), "rex.toml exists already"),
-        (("robot", "new", "model.xml", "--out", "gone/rex.toml"), "cannot write gone/rex.toml"),
-        (("evaluate", "--controller", "pd-imu", "--robot", "rex"), "robot is 'rex'"),
-    ],
-)
-def test_what_is_no_robot_is_refused(
-    arguments: tuple[str, ...],
-    named: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(scene_dir() / "quadruped.xml", "model.xml")
-    Path("rex.toml").write_text("not a robot")
-    before = sorted(tmp_path.iterdir())
-    assert named in refuse(capsys, *arguments)
-    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_policy_stands_on_its_own_robot_alone(capsys: pytest.CaptureFixture[str]) -> None:
@@ -423,10 +330,11 @@ def test_a_policy_stands_on_its_own_robot_alone(capsys: pytest.CaptureFixture[st
 
 
 class StubWindow:
-    """Shows three decisions and is closed, having pressed two keys."""
+    """Shows three decisions and is closed, having pressed a key in each."""
 
     def __init__(self, config: Any, on_key: Any):
         self.shown, self.said, self.on_key = [], [], on_key
+        self.closed = False
 
     @property
     def is_open(self) -> bool:
@@ -443,51 +351,31 @@ class StubWindow:
         self.closed = True
 
 
-def test_view_shows_a_policy_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    windows: list[StubWindow] = []
+@pytest.fixture
+def window(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], StubWindow]:
+    """Flags of `view` -> the window that it opened."""
 
-    def opened(*arguments: Any) -> StubWindow:
-        windows.append(StubWindow(*arguments))
+    def view(flags: str) -> StubWindow:
+        windows: list[StubWindow] = []
+        opened = lambda *given: windows.append(StubWindow(*given)) or windows[-1]  # noqa: E731
+        monkeypatch.setattr("mjx_balance.render.drawing.Window", opened)
+        assert main(["view", *flags.split()]) == 0
+        assert [x.closed for x in windows] == [True]
         return windows[0]
 
-    monkeypatch.setattr("mjx_balance.render.drawing.Window", opened)
-    assert main(["view", "best"]) == 0
-    (window,) = windows
-    assert [x.shape for x in window.shown] == [(50, 21)] * 3
-    assert "falls" in window.said[0][0][1]
-    assert "arrows: tilt the board" in window.said[0][1][1]
-    assert window.closed
+    return view
 
 
-def test_view_shows_the_scenario_of_a_suite_and_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    windows: list[StubWindow] = []
-    opened = lambda *given: windows.append(StubWindow(*given)) or windows[-1]  # noqa: E731
-    monkeypatch.setattr("mjx_balance.render.drawing.Window", opened)
-    assert main("view --controller none --suite corner --seed 3".split()) == 0
-    scene, controller = load_controller(None, "none", None)
+def test_view_shows_a_policy_by_name(window: Callable[[str], StubWindow]) -> None:
+    best = window("best")
+    assert [x.shape for x in best.shown] == [(50, 21)] * 3
+    assert "falls" in best.said[0][0][1]
+    assert "arrows: tilt the board" in best.said[0][1][1]
+
+
+def test_view_shows_the_scenario_of_a_suite_and_seed(window: Callable[[str], StubWindow]) -> None:
+    corner = window("--controller none --suite corner --seed 3")
+    scene, controller = ControllerArgs(controller="none").load()
     rollout = run_suite(scene, controller, "corner", 1, 0.6, 3, record=True)
-    assert rollout.qpos is not None
-    np.testing.assert_allclose(np.concatenate(windows[0].shown), rollout.qpos[0], atol=1e-9)
-    assert {texts[1][1] for texts in windows[0].said} == {"Enter: push"}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        ((), "name a policy file or --controller NAME"),
-        (("nobody",), "no policy file at nobody; `mjx-balance train` writes one, and best"),
-        (("best", "--suite", "sea"), "unknown suite 'sea'"),
-        (("--controller", "pd-imu", "--robot", "rex"), "robot is 'rex'"),
-        (("best", "--seed", "-1"), "seed is -1; it must not be negative"),
-        (("best",), "); `mjx-balance evaluate --video` needs no display\n"),
-    ],
-)
-def test_what_cannot_be_viewed_is_said(
-    arguments: tuple[str, ...],
-    named: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    assert named in refuse(capsys, "view", *arguments)
+    np.testing.assert_allclose(np.concatenate(corner.shown), rollout.qpos[0], atol=1e-9)
+    assert {texts[1][1] for texts in corner.said} == {"Enter: push"}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mjx_balance.cli.viewing import DOWN, LEFT, LEVEL, PUSH_KEY, RIGHT, UP, Session
+from mjx_balance.cli.view import DOWN, LEFT, LEVEL, PUSH_KEY, RIGHT, UP, Session
 from mjx_balance.evaluation.controllers import Controller, View, make_controller
 from mjx_balance.evaluation.rollout import run_suite
 from mjx_balance.evaluation.suites import SuiteError, draw_suite

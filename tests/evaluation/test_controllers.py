@@ -1,6 +1,7 @@
 """Baselines: each does what its knowledge allows."""
 
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +16,13 @@ from mjx_balance.evaluation.controllers import (
     ControllerError,
     ImuPD,
     Predictive,
-    Stand,
     View,
     as_it_will_be,
     at_this_rate,
     make_controller,
     measure_response,
 )
-from mjx_balance.evaluation.rollout import run_suite
-from mjx_balance.evaluation.summary import summarize
+from mjx_balance.evaluation.rollout import run_suite, summarize
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.actions import action_table
@@ -31,16 +30,9 @@ from mjx_balance.task.tilt import Scenario
 
 
 def make_view(
-    scene: Scene,
-    roll_pitch_yaw: np.ndarray,
-    rates: np.ndarray | None = None,
-    imu: np.ndarray | None = None,
-    env_steps: int = 0,
-    ids: np.ndarray | None = None,
-    targets: np.ndarray | None = None,
-    delayed: np.ndarray | None = None,
+    scene: Scene, roll_pitch_yaw: np.ndarray, rates: np.ndarray | None = None, **more: Any
 ) -> View:
-    """What n made-up worlds look like: attitudes (n, 3) in deg, body rates (n, 3) in deg/s."""
+    """What n made-up scenarios look like: attitudes (n, 3) in deg, body rates (n, 3) in deg/s."""
     n = len(roll_pitch_yaw)
     qpos, qvel = np.tile(scene.stance.qpos, (n, 1)), np.zeros((n, scene.model.nv))
     turn = Rotation.from_euler("ZYX", roll_pitch_yaw[:, ::-1], degrees=True)
@@ -48,23 +40,22 @@ def make_view(
     if rates is not None:
         root = scene.model.joint("robot/root").dofadr[0]
         qvel[:, root + 3 : root + 6] = np.radians(rates)
-    return View(
-        ids=np.arange(n) if ids is None else ids,
-        env_steps=env_steps,
+    view = View(
+        ids=np.arange(n),
+        env_steps=0,
         obs=np.zeros((n, 34)),
-        imu=np.tile(scene.stance.imu, (n, 50, 1)) if imu is None else imu,
+        imu=np.tile(scene.stance.imu, (n, 50, 1)),
         qpos=qpos,
         qvel=qvel,
-        scenario=Scenario(
-            np.zeros((n, 2, 2)) if targets is None else targets, np.zeros(n), np.full(n, 3.5)
-        ),
-        delayed=np.zeros(n, bool) if delayed is None else delayed,
+        scenario=Scenario(np.zeros((n, 2, 2)), np.zeros(n), np.full(n, 3.5)),
+        delayed=np.zeros(n, bool),
     )
+    return view._replace(**more)
 
 
 def test_standing_still_is_the_action_that_changes_nothing(scene: Scene) -> None:
     view = make_view(scene, np.full((3, 3), 5.0))
-    assert Stand(scene)(view).tolist() == [220, 220, 220]
+    assert make_controller("none", scene)(view).tolist() == [220, 220, 220]
 
 
 def test_proportional_and_derivative_by_hand(scene: Scene) -> None:
@@ -85,18 +76,15 @@ def test_proportional_and_derivative_by_hand(scene: Scene) -> None:
     np.testing.assert_allclose(rate[1], (1.0, 0.5), atol=1e-9)
 
 
-def test_gains_are_arguments(scene: Scene) -> None:
-    """-(0.5 * 0.4 + 0.2 * 1) / 400 = -1 mm: -0.9, level 7."""
-    controller = AttitudePD(scene, proportional=0.5, rate=0.2)
-    controller.gain = np.asarray((400.0, -300.0))
-    view = make_view(scene, np.asarray([(0.4, 0.0, 0.0)]), np.asarray([(1.0, 0.0, 0.0)]))
-    assert controller(view).tolist() == [21 * 7 + 10]
-
-
 def test_gains_are_those_that_the_benchmark_found_best(scene: Scene) -> None:
+    """Unless others are given: -(0.5 * 0.4 + 0.2 * 1) / 400 = -1 mm: -0.9, level 7."""
     imu, true = ImuPD(scene), AttitudePD(scene)
     assert (imu.proportional, imu.rate, imu.tau, imu.samples) == (1.2, 0.14, 4.0, 1)
     assert (true.proportional, true.rate) == (1.3, 0.12)
+    other = AttitudePD(scene, proportional=0.5, rate=0.2)
+    other.gain = np.asarray((400.0, -300.0))
+    view = make_view(scene, np.asarray([(0.4, 0.0, 0.0)]), np.asarray([(1.0, 0.0, 0.0)]))
+    assert other(view).tolist() == [21 * 7 + 10]
 
 
 def test_complementary_filter_sample_by_sample(scene: Scene) -> None:
@@ -128,9 +116,8 @@ def test_complementary_filter_sample_by_sample(scene: Scene) -> None:
 def test_filter_starts_anew_with_every_evaluation(scene: Scene) -> None:
     controller = ImuPD(scene)
     tilted = np.tile((0.5, 0.5, 0.0, 1.0, 1.0, 9.7), (2, 50, 1))
-    first = controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted))[0]
-    controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted, env_steps=1))
-    again = controller.state(make_view(scene, np.zeros((2, 3)), imu=tilted))[0]
+    view = make_view(scene, np.zeros((2, 3)), imu=tilted)
+    first, _, again = (controller.state(view._replace(env_steps=k))[0] for k in (0, 1, 0))
     np.testing.assert_array_equal(first, again)
 
 
@@ -148,11 +135,10 @@ def best_plan(
     effect = np.zeros((400, HORIZON))
     for j in range(HORIZON):
         effect[50 * j :, j] = course[: 400 - 50 * j]
-    if first is not None:
-        free = free + effect[:, 0] * first
-        rest = lsq_linear(effect[:, 1:], -free, (-limit, limit), tol=1e-12).x
-        return np.concatenate(([first], rest))
-    return lsq_linear(effect, -free, (-limit, limit), tol=1e-12).x
+    fixed = [] if first is None else [first]
+    free = free + effect[:, : len(fixed)] @ fixed
+    rest = lsq_linear(effect[:, len(fixed) :], -free, (-limit, limit), tol=1e-12).x
+    return np.append(fixed, rest)
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -172,7 +158,7 @@ def test_plans_are_the_least_squares_optimum(
     gain, course = courses
     controller = Predictive(scene, as_it_will_be)
     limits = np.abs(gain) * 0.003
-    targets = np.asarray([[(5.0, -3.0), (5.0, -3.0)]])
+    scenario = Scenario(np.asarray([[(5.0, -3.0), (5.0, -3.0)]]), np.zeros(1), np.full(1, 3.5))
     taken = [np.zeros(2)]  # in the order in which they act
     waiting = np.zeros(2)
     for decision, attitude in enumerate(((0.8, -0.5), (0.5, 0.2), (-0.3, 0.1))):
@@ -180,7 +166,7 @@ def test_plans_are_the_least_squares_optimum(
             scene,
             np.asarray([(*attitude, 30.0)]),
             env_steps=decision,
-            targets=targets,
+            scenario=scenario,
             delayed=np.asarray([late]),
         )
         action = controller(view)
@@ -249,12 +235,13 @@ def test_forecasts_of_a_ramp() -> None:
 
 
 def test_controllers_by_name(scene: Scene) -> None:
-    names = "none pd-imu pd-attitude rate-oracle clairvoyant".split()
-    kinds = [type(make_controller(name, scene)) for name in names]
-    assert kinds == [Stand, ImuPD, AttitudePD, Predictive, Predictive]
-    oracles = [make_controller(name, scene) for name in names[3:]]
-    forecasts = [c.forecast for c in oracles if isinstance(c, Predictive)]
+    made = [make_controller(name, scene) for name in CONTROLLERS]
+    assert list(CONTROLLERS) == "none pd-imu pd-attitude rate-oracle clairvoyant".split()
+    assert [type(x) for x in made[1:]] == [ImuPD, AttitudePD, Predictive, Predictive]
+    forecasts = [x.forecast for x in made if isinstance(x, Predictive)]
     assert forecasts == [at_this_rate, as_it_will_be]
+    with pytest.raises(ControllerError, match="unknown controller 'lqr'; known controllers: none"):
+        make_controller("lqr", scene)
 
 
 @pytest.mark.slow
@@ -289,8 +276,3 @@ def test_filters_keep_every_worlds_own_memory(scene: Scene) -> None:
     many = run_suite(scene, controller, "corner", 3, 4.0, 0).tilt
     alone = run_suite(scene, controller, "corner", 1, 4.0, 0).tilt
     np.testing.assert_allclose(many[0], alone[0], atol=1e-9)
-
-
-def test_unknown_controller_is_refused(scene: Scene) -> None:
-    with pytest.raises(ControllerError, match="unknown controller 'lqr'; known controllers: none"):
-        make_controller("lqr", scene)

@@ -47,7 +47,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 def screen(terminal: bool) -> tuple[Display, io.StringIO]:
     out = io.StringIO()
-    return Display(Console(file=out, force_terminal=terminal, width=110)), out
+    return Display(Console(file=out, force_terminal=terminal, no_color=False, width=110)), out
 
 
 def plain(text: str) -> list[str]:
@@ -79,12 +79,13 @@ def test_plain_output_is_one_line_per_interval(clock: Clock) -> None:
     ]
 
 
-def test_plain_output_leaves_out_what_is_not_known(clock: Clock) -> None:
+def test_plain_output_leaves_out_what_is_not_known_and_adds_warnings(clock: Clock) -> None:
     display, out = screen(terminal=False)
     with display.training(0, 10):
         clock.now += 5.0
-        display.update(10, {"train/reward": -0.5})
-    assert out.getvalue().split("decisions")[1].split() == ["reward", "-0.500", "left", "0", "s"]
+        display.update(10, {"train/reward": -0.5, "train/skipped_updates": 0.25})
+    line = out.getvalue().split("decisions")[1].strip()
+    assert line == "reward -0.500  skipped updates 25.0%  left 0 s"
 
 
 VALIDATED = {
@@ -118,16 +119,6 @@ def test_a_validation_is_shown_until_the_next_one(clock: Clock) -> None:
     ]
 
 
-def test_a_terminal_shows_a_validation_in_a_row_of_its_own() -> None:
-    display, out = screen(terminal=True)
-    with display.training(200, 1_000):
-        display.update(600, METRICS | VALIDATED)
-        display.update(800, METRICS)
-    lines = [line.strip("│ ") for line in plain(out.getvalue())]
-    last = len(lines) - 1 - lines[::-1].index(next(x for x in lines if "mjx_balance" in x))
-    assert lines[last + 2 : last + 5] == [" ".join(x) for x in (CELLS[:3], CELLS[3:], HELD_OUT)]
-
-
 def test_a_phase_says_what_is_done_and_how_long_it_took(clock: Clock) -> None:
     display, out = screen(terminal=False)
     with display.phase("compiling"):
@@ -139,31 +130,35 @@ def test_a_phase_says_what_is_done_and_how_long_it_took(clock: Clock) -> None:
     assert plain(out.getvalue())[-1] == "compiling: 61.0 s"
 
 
+def last_panel(text: str) -> list[str]:
+    """The lines of the panel that was drawn last, with its title."""
+    lines = [line.strip("│ ") for line in plain(text)]
+    return lines[max(k for k, line in enumerate(lines) if "mjx_balance" in line) :]
+
+
 def test_a_terminal_shows_every_number_under_its_name() -> None:
     display, out = screen(terminal=True)
     with display.training(200, 1_000):
-        display.update(800, METRICS)
-    lines = [line.strip("│ ") for line in plain(out.getvalue())]
-    panel = lines[
-        len(lines) - 1 - lines[::-1].index(next(x for x in lines if "mjx_balance" in x)) :
-    ]
-    assert panel[2] == " ".join(CELLS[:3])
-    assert panel[3] == " ".join(CELLS[3:])
-    assert "training" in panel[1]
+        display.update(600, METRICS | VALIDATED)
+        display.update(800, METRICS | {"train/diverged": 2.0})
+    panel = last_panel(out.getvalue())
+    assert panel[1].startswith(("⠋ training", "⠙ training"))
     assert "800/1000 decisions" in panel[1]
+    rows = (CELLS[:3], CELLS[3:], HELD_OUT, ("diverged envs 2",))
+    assert panel[2:6] == [" ".join(row) for row in rows]
 
 
 def test_a_terminal_shows_a_dash_before_the_first_numbers_and_no_more_than_all() -> None:
     display, out = screen(terminal=True)
     with display.training(200, 1_000):
         pass
-    text = " ".join(plain(out.getvalue()))
-    assert "200/1000 decisions" in text
-    assert "decisions/s - mean tilt - falls per robot-minute -" in text
+    panel = last_panel(out.getvalue())
+    assert "200/1000 decisions" in panel[1]
+    assert panel[2] == "decisions/s - mean tilt - falls per robot-minute -"
     display, out = screen(terminal=True)
     with display.training(0, 1_000):
         display.update(1_024, METRICS)
-    assert "1000/1000 decisions" in " ".join(plain(out.getvalue()))
+    assert "1000/1000 decisions" in last_panel(out.getvalue())[1]
 
 
 def test_a_bar_moves_to_the_share_that_is_done() -> None:
@@ -172,20 +167,15 @@ def test_a_bar_moves_to_the_share_that_is_done() -> None:
         bar(0.5)
     assert out.getvalue() == "evaluating ...\n"
     display, out = screen(terminal=True)
-    with display.bar("evaluating") as bar:
+    with display.bar("evaluating [bold]") as bar:
         bar(0.25)
-        assert bar._progress is not None
-        assert bar._progress.tasks[0].percentage == 25.0
-        bar._progress.refresh()
-    assert "evaluating" in out.getvalue()
+    lines = [line for line in plain(out.getvalue()) if "evaluating [bold] " in line]
+    assert re.findall("(━+)╺━", lines[-1]) == ["━" * 10], "a quarter of 40"
 
 
 def test_messages_are_printed_as_they_are() -> None:
+    """Neither wrapped nor taken for markup."""
     display, out = screen(terminal=False)
     message = "a path /[bold]" + "x" * 120
     display.say(message)
-    assert out.getvalue() == f"{message}\n", "neither wrapped nor taken for markup"
-    display, out = screen(terminal=True)
-    with display.bar("evaluating [bold]"):
-        pass
-    assert "[bold]" in "".join(plain(out.getvalue()))
+    assert out.getvalue() == f"{message}\n"

@@ -2,19 +2,21 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from mjx_balance.evaluation.envelope import Envelope
 from mjx_balance.evaluation.rollout import Rollout
 from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report import measuring
-from mjx_balance.report.measuring import load_or_measure
+from mjx_balance.report.measuring import Measurements, code, code_digest, load_or_measure
 from mjx_balance.report.reading import FOREIGN
 from mjx_balance.sim.scene import Scene, load_scene
 
@@ -33,9 +35,18 @@ def its_scene(policy: Policy) -> Scene:
     return load_scene(policy.config)
 
 
-@contextlib.contextmanager
-def no_bar(title: str) -> Iterator[Any]:
-    yield lambda share: None
+@pytest.fixture
+def measure(
+    policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
+) -> Callable[..., Measurements]:
+    """Measures, or reads what `report.json` in the test's folder holds."""
+
+    def run(scenarios: int, policy: Policy = policy) -> Measurements:
+        file = tmp_path / "report.json"
+        no_bar = lambda title: contextlib.nullcontext(lambda share: None)  # noqa: E731
+        return load_or_measure(policy, its_scene, file, scenarios, no_bar)
+
+    return run
 
 
 @pytest.fixture
@@ -64,9 +75,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
 
 
 def test_everyone_is_measured_on_the_same_scenarios(
-    policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
+    policy: Policy, calls: list[tuple], measure: Any
 ) -> None:
-    found = load_or_measure(policy, its_scene, tmp_path / "report.json", 5, no_bar)
+    found = measure(5)
     *suites, mapped = calls
     assert [call[1] for call in suites] == ["paper", "corner"] * 6
     assert {call[2:] for call in suites} == {(5, 60.0, 4_000_000, False)}
@@ -86,10 +97,8 @@ def test_everyone_is_measured_on_the_same_scenarios(
             assert (result["scenarios"], result["falls"]) == (5, 1)
 
 
-def test_shares_are_those_of_the_physics_steps_in_each_bin(
-    policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
-) -> None:
-    found = load_or_measure(policy, its_scene, tmp_path / "report.json", 2, no_bar)
+def test_shares_are_those_of_the_physics_steps_in_each_bin(measure: Any) -> None:
+    found = measure(2)
     edges = measuring.edges(6.0)
     assert (edges[0], edges[1], edges[-2]) == (0, 0.01, pytest.approx(6))
     share = found.shares["policy"]["paper"]
@@ -106,34 +115,31 @@ def test_shares_are_those_of_the_physics_steps_in_each_bin(
 
 @pytest.mark.slow
 def test_what_was_measured_is_kept(
-    policy: Policy,
-    its_scene: Scene,
-    calls: list[tuple],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    policy: Policy, calls: list[tuple], measure: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "report.json"
-    first = load_or_measure(policy, its_scene, file, 5, no_bar)
-    count = len(calls)
-    assert load_or_measure(policy, its_scene, file, 5, no_bar) == first
-    assert len(calls) == count, "nothing was measured again"
-    load_or_measure(policy, its_scene, file, 6, no_bar)
-    assert len(calls) == 2 * count, "another number of scenarios"
-    monkeypatch.setattr(measuring, "DURATION", 61.0)
-    load_or_measure(policy, its_scene, file, 6, no_bar)
-    assert len(calls) == 3 * count, "another duration"
-    other = Policy(policy.manifest, weights_of(SHIPPED, by=1.001))
-    load_or_measure(other, its_scene, file, 6, no_bar)
-    assert len(calls) == 4 * count, "another network"
+    """Until anything changes that decides a result; a measurement is 13 calls."""
+    first = measure(5)
+    assert measure(5) == first
+    assert len(calls) == 13, "nothing was measured again"
+    measure(6)
+    assert len(calls) == 2 * 13, "another number of scenarios"
+    changes = {"DURATION": 61.0, "ENVELOPE_SCENARIOS": 3, "ENVELOPE_DURATION": 31.0}
+    for k, (name, value) in enumerate(changes.items(), 3):
+        monkeypatch.setattr(measuring, name, value)
+        measure(6)
+        assert len(calls) == k * 13, name
+    weights = safetensors.numpy.load_file(SHIPPED)
+    scaled = {name: (1.001 * value).astype(np.float32) for name, value in weights.items()}
+    other = Policy(policy.manifest, scaled)
+    measure(6, other)
+    assert len(calls) == 6 * 13, "another network"
     task = dataclasses.replace(policy.config.task, action_ramp=0.3)
     other.config = dataclasses.replace(policy.config, task=task)
-    load_or_measure(other, its_scene, file, 6, no_bar)
-    assert len(calls) == 5 * count, "the same network in another task"
-    monkeypatch.setattr(measuring, "ENVELOPE_SCENARIOS", 3)
-    load_or_measure(other, its_scene, file, 6, no_bar)
-    monkeypatch.setattr(measuring, "ENVELOPE_DURATION", 31.0)
-    load_or_measure(other, its_scene, file, 6, no_bar)
-    assert len(calls) == 7 * count, "another envelope"
+    measure(6, other)
+    assert len(calls) == 7 * 13, "the same network in another task"
+    monkeypatch.setattr(measuring, "code_digest", lambda: "other")
+    measure(6, other)
+    assert len(calls) == 8 * 13, "other code"
 
 
 HOSTILE = "<img src=x onerror=alert(1)>"
@@ -143,89 +149,54 @@ HOSTILE = "<img src=x onerror=alert(1)>"
 @pytest.mark.parametrize(
     "where",
     [
-        ("results",),
-        ("results", "none"),
-        ("results", "none", "corner", "falls"),
-        ("results", "policy", "paper", "scenarios"),
-        ("results", "policy", "paper", "tilt_deg", "p95"),
-        ("results", "policy", "paper", "action_mm_settled"),
-        ("shares", "none", "paper"),
-        ("shares", "none", "paper", 3),
-        ("envelope",),
-        ("envelope", "rates", 0),
-        ("envelope", "fall_rate", 1),
-        ("envelope", "mean_tilt", 1, 0),
-        ("envelope", "authority"),
-        ("envelope", "reach"),
-        ("envelope", "scenarios"),
-        ("envelope", "duration_s"),
-        ("envelope", "seed"),
+        "results",
+        "results none",
+        "results none corner falls",
+        "results policy paper scenarios",
+        "results policy paper tilt_deg p95",
+        "results policy paper action_mm_settled",
+        "shares none paper",
+        "shares none paper 3",
+        "envelope",
+        "envelope rates 0",
+        "envelope fall_rate 1",
+        "envelope mean_tilt 1 0",
+        *(f"envelope {name}" for name in "authority reach scenarios duration_s seed".split()),
     ],
-    ids=lambda where: "-".join(map(str, where)),
 )
-def test_what_was_not_measured_is_refused(
-    policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path, where: tuple
-) -> None:
-    file = tmp_path / "report.json"
-    first = load_or_measure(policy, its_scene, file, 5, no_bar)
-    saved = json.loads(file.read_text())
+def test_what_was_not_measured_is_refused(tmp_path: Path, measure: Any, where: str) -> None:
+    first = measure(5)
+    saved = json.loads((tmp_path / "report.json").read_text())
     assert measuring.parse_measurements(saved) == first
-    inside = saved
-    for name in where[:-1]:
-        inside = inside[name]
-    for bad in (HOSTILE, [], None, [[]], float("nan")):
-        if (bad, where[-1]) == (None, "action_mm_settled"):
-            continue  # a robot that always fell
-        inside[where[-1]] = bad
+    *path, last = (int(name) if name.isdigit() else name for name in where.split())
+    inside = functools.reduce(lambda part, name: part[name], path, saved)
+    optional = last == "action_mm_settled"  # of a robot that always fell
+    for bad in (HOSTILE, [], [[]], float("nan"), *([] if optional else [None])):
+        inside[last] = bad
         with pytest.raises(FOREIGN):
             measuring.parse_measurements(saved)
-    del inside[where[-1]]
-    if where[-1] != "action_mm_settled":
+    del inside[last]
+    if not optional:
         with pytest.raises(FOREIGN):
             measuring.parse_measurements(saved)
 
 
 @pytest.mark.slow
-def test_a_damaged_file_is_measured_again(
-    policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
-) -> None:
-    file = tmp_path / "report.json"
-    first = load_or_measure(policy, its_scene, file, 5, no_bar)
+def test_a_damaged_file_is_measured_again(calls: list[tuple], tmp_path: Path, measure: Any) -> None:
+    first, file = measure(5), tmp_path / "report.json"
     saved = json.loads(file.read_text())
     saved["results"]["policy"]["paper"]["falls"] = HOSTILE
     for bad in (json.dumps(saved), "[" * 100_000, "{", "null"):
         file.write_text(bad)
         calls.clear()
-        assert load_or_measure(policy, its_scene, file, 5, no_bar) == first
+        assert measure(5) == first
 
 
 def test_a_folder_that_cannot_be_written_is_measured_all_the_same(
-    policy: Policy, its_scene: Scene, calls: list[tuple], tmp_path: Path
+    tmp_path: Path, measure: Any
 ) -> None:
     (tmp_path / "report.json").mkdir()
-    found = load_or_measure(policy, its_scene, tmp_path / "report.json", 5, no_bar)
-    assert list(found.results) == list(NAMES)
-
-
-def test_with_other_code_everything_is_measured_again(
-    policy: Policy,
-    its_scene: Scene,
-    calls: list[tuple],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    file = tmp_path / "report.json"
-    load_or_measure(policy, its_scene, file, 5, no_bar)
-    monkeypatch.setattr(measuring, "code_digest", lambda: "other")
-    load_or_measure(policy, its_scene, file, 5, no_bar)
-    assert len(calls) == 2 * 13
-
-
-def weights_of(path: Path, by: float) -> dict[str, np.ndarray]:
-    import safetensors.numpy
-
-    weights = safetensors.numpy.load_file(path)
-    return {name: (by * value).astype(np.float32) for name, value in weights.items()}
+    assert list(measure(5).results) == list(NAMES)
 
 
 def test_one_recorded_scenario(policy: Policy, calls: list[tuple]) -> None:
@@ -236,3 +207,20 @@ def test_one_recorded_scenario(policy: Policy, calls: list[tuple]) -> None:
         ("paper", 1, 100.0, 8, True),
     ]
     assert calls[1][0] == "pd-imu 1"
+
+
+def test_the_code_that_decides_a_result_is_in_its_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, sources = code_digest(), code("mjx_balance.evaluation.envelope")
+    names = "evaluation.rollout evaluation.controllers evaluation.suites sim.scene task task.tilt"
+    inside = {f"mjx_balance.{name}" for name in (*names.split(), "config", "sim.engines.mujoco")}
+    assert inside <= set(sources)
+    names = "sim.engines.mjx report.page report.figures dqn.replay envs.balance cli"
+    assert not {f"mjx_balance.{name}" for name in names.split()} & set(sources)
+    for name in inside:
+        changed = sources | {name: f"{sources[name]}\nadded = 1"}
+        monkeypatch.setattr(measuring, "code", lambda *_, changed=changed: changed)
+        assert code_digest() != before
+    monkeypatch.setattr(measuring, "code", lambda *_: sources)
+    assert code_digest() == before
+    monkeypatch.setattr(measuring.mujoco, "__version__", "0")
+    assert code_digest() != before
