@@ -81,7 +81,7 @@ def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
 
 
 def test_pushes_by_their_draws(config: Config) -> None:
-    """Kicks of 0.2 to 0.4 m/s every 5 s; a scenario's come from a generator of their own."""
+    """Pushes of 0.2 to 0.4 m/s every 5 s; a scenario's come from a generator of their own."""
     pushes = draw_suite(config, "push", 3, 60.0, 5).pushes
     assert pushes.due[2].tolist() == [25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 275]
     for k in range(3):
@@ -95,26 +95,21 @@ def test_pushes_by_their_draws(config: Config) -> None:
     np.testing.assert_array_equal(shorter.velocity, pushes.velocity[:, :5])
 
 
-def test_pushes_happen_in_the_world_of_paper_and_in_no_other_suite(config: Config) -> None:
+def test_pushes_happen_in_the_scenarios_of_paper_and_in_no_other_suite(config: Config) -> None:
     push, paper = (draw_suite(config, name, 4, 60.0, 2) for name in ("push", "paper"))
     for ours, theirs in zip(push.scenario, paper.scenario, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    assert push.params is not None
     for values in (push.params.payload, push.params.imu_noise, push.params.delay):
         assert not values.any()
     for name in SUITES:
         pushes = draw_suite(config, name, 4, 60.0, 2).pushes
-        assert (None if pushes is None else pushes.velocity.shape) == (
-            (4, 11, 2) if name == "push" else None
-        )
+        assert (pushes is not None) == (name == "push")
 
 
 def test_a_config_beyond_the_limits_is_left_as_it_is(config: Config) -> None:
     """A board that is faster than can be followed is no slower in `fast`."""
     quick = with_task(config, board_rate=6.0)
-    np.testing.assert_array_equal(
-        draw_suite(quick, "fast", 3, 20, 0).scenario.rate, np.full(3, 6.0)
-    )
+    assert draw_suite(quick, "fast", 3, 20, 0).scenario.rate.tolist() == [6.0] * 3
 
 
 @pytest.mark.parametrize(("duration", "targets"), [(5.0, 2), (10.0, 2), (10.1, 3), (60.0, 7)])
@@ -127,43 +122,24 @@ def test_a_board_that_does_not_arrive_is_refused(config: Config) -> None:
     just = with_task(config, target_period=4.0)
     for suite in ("paper", "corner", "fast"):
         draw_suite(just, suite, 5, 20, 0)
-    with pytest.raises(
-        SuiteError, match=r"target_period is 4\.0 s, but in suite 'steep' .* [45]\.\d"
-    ):
+    with pytest.raises(SuiteError, match=r"period is 4\.0 s, but in suite 'steep' .* [45]\.\d"):
         draw_suite(just, "steep", 50, 20, 0)
-    with pytest.raises(
-        SuiteError, match=r"target_period is 3\.99 s, but in suite 'corner' .* 4\.0"
-    ):
+    with pytest.raises(SuiteError, match=r"period is 3\.99 s, but in suite 'corner' .* 4\.0"):
         draw_suite(with_task(config, target_period=3.99), "corner", 1, 20, 0)
 
 
 def test_impossible_wishes_are_refused(config: Config) -> None:
     with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
         draw_suite(config, "paper", 1, 10, -1)
-    with pytest.raises(SuiteError, match="unknown suite 'moon'; known suites: paper, corner, noi"):
+    names = "paper, corner, noise, payload, friction, gains, latency, push, fast, steep"
+    with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
         find_suite("moon")
-
-
-def test_suites_are_known_by_these_names() -> None:
-    names = "paper corner noise payload friction gains latency push fast steep".split()
-    assert set(names) <= set(SUITES)
 
 
 def test_no_seed_serves_two_purposes() -> None:
     """What a policy is chosen or tuned by must not be what it is judged by."""
     seeds = dataclasses.astuple(SEEDS)
     assert len(set(seeds)) == len(seeds) == 6
-
-
-def test_paper_fills_the_disc_and_corner_its_corners(config: Config) -> None:
-    paper = draw_suite(config, "paper", 400, 60, 0).scenario.targets
-    size = np.linalg.norm(paper, axis=-1)
-    assert size.max() <= 7
-    assert np.mean(size) == pytest.approx(3.5, abs=0.15)
-    assert np.abs(paper.mean(axis=(0, 1))).max() < 0.2
-    corner = draw_suite(config, "corner", 50, 60, 0).scenario.targets
-    assert np.all(np.abs(corner) == 7)
-    assert len(np.unique(corner.reshape(-1, 2), axis=0)) == 4
 
 
 def test_authority_and_reach_by_hand(config: Config, robot: Robot) -> None:
@@ -184,25 +160,21 @@ def test_authority_and_reach_by_hand(config: Config, robot: Robot) -> None:
         ("friction", "friction", 0.4, 1.0),
         ("gains", "gain", 0.8, 1.2),
         ("latency", "delay", 1.0, 1.0),
+        ("noise", "imu_noise", 0.002, 0.023),
     ],
 )
 def test_conditions_fill_their_range(
     config: Config, suite: str, field: str, least: float, most: float
 ) -> None:
-    conditions = draw_suite(config, suite, 300, 10, 0).params
-    values = getattr(conditions, field)
+    params = draw_suite(config, suite, 300, 10, 0).params
+    values = getattr(params, field)
     margin = 0.03 * (most - least)
     assert least <= values.min() <= least + margin
     assert most - margin <= values.max() <= most
     nominal = draw_params(RandomizationConfig(), find_robot("quadruped"), np.zeros((300, DRAWS)))
-    for name in conditions._fields:
+    for name in params._fields:
         if name not in (field, "payload_at"):
-            np.testing.assert_array_equal(getattr(conditions, name), getattr(nominal, name))
-
-
-def test_noise_is_that_of_a_data_sheet(config: Config) -> None:
-    sigma = draw_suite(config, "noise", 3, 10, 0).params.imu_noise
-    np.testing.assert_array_equal(sigma, np.tile((0.002,) * 3 + (0.023,) * 3, (3, 1)))
+            np.testing.assert_array_equal(getattr(params, name), getattr(nominal, name))
 
 
 def test_every_suite_follows_the_configs_incline(config: Config) -> None:
@@ -212,7 +184,7 @@ def test_every_suite_follows_the_configs_incline(config: Config) -> None:
             assert np.abs(draw_suite(flat, name, 20, 60, 0).scenario.targets).max() <= 2.0
 
 
-def test_loads_and_kicks_go_with_the_robot() -> None:
+def test_loads_and_pushes_go_with_the_robot() -> None:
     """B2 is 5.493 times as heavy as ours, and 1.702 times as long."""
     config = for_robot(preset("default"), "b2")
     conditions = draw_suite(config, "payload", 200, 1.0, 0).params

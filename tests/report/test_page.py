@@ -162,17 +162,9 @@ def made_up(policy: Policy) -> Measurements:
         name: {"paper": [0.5] + [0.0] * 159 + [0.5], "corner": [1.0] + [0.0] * 160}
         for name in results
     }
-    envelope = Envelope(
-        inclines=[2.0, 3.0, 20.0],
-        rates=[2.5, 3.0, 9.0],
-        fall_rate=[[0.0, 0.0, 1.0], [0.0, 0.5, 1.0], [1.0, 1.0, 1.0]],
-        mean_tilt=[[0.1] * 3] * 3,
-        authority=4.456,
-        reach=10.34,
-        scenarios=3,
-        duration_s=31.0,
-        seed=0,
-    )
+    falls = [[0.0, 0.0, 1.0], [0.0, 0.5, 1.0], [1.0, 1.0, 1.0]]
+    inclines, rates, tilts = [2.0, 3.0, 20.0], [2.5, 3.0, 9.0], [[0.1] * 3] * 3
+    envelope = Envelope(inclines, rates, falls, tilts, 4.456, 10.34, 3, 31.0, 0)
     return Measurements(results, shares, envelope)
 
 

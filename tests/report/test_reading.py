@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,21 @@ from hypothesis import strategies as st
 from mjx_balance.config import preset, to_dict
 from mjx_balance.files import run_folder
 from mjx_balance.report import page, reading
-from mjx_balance.report.reading import ReportError
+from mjx_balance.report.reading import ReportError, Run
 
 HOSTILE = "<img src=x onerror=alert(1)>"
+AGAIN = "the first line again"
 
 
-@pytest.fixture(scope="session")
-def good_line(metrics_line: Any) -> str:
-    """The first line of a metrics.jsonl."""
-    return json.dumps(metrics_line(0, 1))
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[[list[dict[str, Any]]], Run]:
+    """Lines of a metrics.jsonl -> what is read of a folder that holds them."""
+
+    def read_lines(lines: list[dict[str, Any]]) -> Run:
+        (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+        return reading.read_run(tmp_path)
+
+    return read_lines
 
 
 @pytest.fixture(scope="session")
@@ -43,70 +50,59 @@ def good(metrics_line: Any, evaluations: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("config.json", "[]", "config.json cannot be used: Config is []; it must map"),
-        ("config.json", '{"task": []}', "config.json cannot be used: task is []; it must map"),
-        ("config.json", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a finite number"),
-        ("metrics.jsonl", 'GOOD\n{"env_st', "metrics.jsonl is shown up to line 2"),
-        (
-            "metrics.jsonl",
-            'GOOD\n{"env_steps": 9999}',
-            "train/tilt_deg is None; it must",
-        ),
-        ("metrics.jsonl", "GOOD\n5", "metrics.jsonl is shown up to line 2"),
-        (
-            "metrics.jsonl",
-            "GOOD\nGOOD",
-            "line 2, which cannot be used: env_steps is 1",
-        ),
-        ("seeds.json", '{"best": 1}', "seeds.json cannot be used: seeds is missing"),
-        ("seeds.json", "[1]", "seeds.json cannot be used: it is [1]; it must map its fields"),
-        ("seeds.json", '{"seeds": {}}', "seeds is {}; it must be a list"),
-        (
-            "seeds.json",
-            f'{{"seeds": [{", ".join(["{}"] * 1001)}]}}',
-            "length of at most 1000",
-        ),
-        (
-            "evaluation.json",
-            '{"paper": {"falls": 0}}',
-            "evaluation.json cannot be used: scenarios is ",
-        ),
-        ("evaluation.json", '{"paper": 1}', "paper is 1; it must map its fields to values"),
-        ("evaluation.json", "[" * 100_000, "evaluation.json cannot be used: it is nested too deep"),
-        ("evaluation.json", "9" * 5_000, "evaluation.json cannot be used: it is no JSON: Exceeds"),
-        ("evaluation.json", " " * (2**21 + 1), "it is 2.0 MiB long; at most 1 MiB are read"),
-        ("evaluation.json", b"\xff\xfe\x00{", "evaluation.json cannot be used: it is no JSON"),
-        (
-            "evaluation.json",
-            '{"\\u001b[2J\\ud800": 1}',
-            "cannot be used: it is {'\\x1b[2J\\ud800'",
-        ),
-        (
-            "metrics.jsonl",
-            "GOOD\n" + " " * 2**19,
-            "line 2, which cannot be used: it is longer",
-        ),
-        ("config.json", b"\x80", "config.json cannot be used: it is no JSON"),
+        ("config", "[]", "config.json cannot be used: Config is []; it must map"),
+        ("config", '{"task": []}', "config.json cannot be used: task is []; it must map"),
+        ("config", '{"dqn": {"gamma": "x"}}', "gamma is 'x'; it must be a finite number"),
+        ("config", b"\x80", "config.json cannot be used: it is no JSON"),
+        ("seeds", '{"best": 1}', "seeds.json cannot be used: seeds is missing"),
+        ("seeds", "[1]", "seeds.json cannot be used: it is [1]; it must map its fields"),
+        ("seeds", '{"seeds": {}}', "seeds is {}; it must be a list"),
+        ("seeds", f'{{"seeds": [{"{}, " * 1000}{{}}]}}', "length of at most 1000"),
+        ("evaluation", '{"paper": {"falls": 0}}', "evaluation.json cannot be used: scenarios is "),
+        ("evaluation", '{"paper": 1}', "paper is 1; it must map its fields to values"),
+        ("evaluation", "[" * 100_000, "evaluation.json cannot be used: it is nested too deep"),
+        ("evaluation", "9" * 5_000, "evaluation.json cannot be used: it is no JSON: Exceeds"),
+        ("evaluation", " " * (2**21 + 1), "it is 2.0 MiB long; at most 1 MiB are read"),
+        ("evaluation", b"\xff\xfe\x00{", "evaluation.json cannot be used: it is no JSON"),
+        ("evaluation", '{"\\u001b[2J\\ud800": 1}', "cannot be used: it is {'\\x1b[2J\\ud800'"),
     ],
 )
 def test_contents_that_are_not_a_runs_are_named_and_the_rest_is_read(
-    tmp_path: Path, name: str, content: str | bytes, said: str, good_line: Any
+    tmp_path: Path, name: str, content: str | bytes, said: str, metrics_line: Any, read: Any
 ) -> None:
-    (tmp_path / "metrics.jsonl").write_text(f"{good_line}\n")
-    if isinstance(content, str):
-        content = content.replace("GOOD", good_line).encode()
-    (tmp_path / name).write_bytes(content)
-    run = reading.read_run(tmp_path)
+    content = content.encode() if isinstance(content, str) else content
+    (tmp_path / f"{name}.json").write_bytes(content)
+    run = read([metrics_line(0, 1)])
     assert said in "\n".join(run.missing)
     assert len(run.metrics) == 1
     assert all(len(sentence) < 500 for sentence in run.missing)
 
 
-def test_a_folder_in_a_files_place_is_said(tmp_path: Path, good_line: Any) -> None:
-    (tmp_path / "metrics.jsonl").write_text(f"{good_line}\n")
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ('{"env_st', "metrics.jsonl is shown up to line 2"),
+        ('{"env_steps": 9999}', "train/tilt_deg is None; it must"),
+        ("5", "metrics.jsonl is shown up to line 2"),
+        (AGAIN, "line 2, which cannot be used: env_steps is 1"),
+        (" " * 2**19, "line 2, which cannot be used: it is longer"),
+    ],
+)
+def test_metrics_are_read_up_to_the_first_line_that_is_none(
+    tmp_path: Path, content: str, said: str, metrics_line: Any
+) -> None:
+    first = json.dumps(metrics_line(0, 1))
+    second = first if content == AGAIN else content
+    (tmp_path / "metrics.jsonl").write_text(f"{first}\n{second}")
+    run = reading.read_run(tmp_path)
+    assert said in "\n".join(run.missing)
+    assert len(run.metrics) == 1
+
+
+def test_a_folder_in_a_files_place_is_said(tmp_path: Path, metrics_line: Any, read: Any) -> None:
     for name in ("config.json", "seeds.json"):
         (tmp_path / name).mkdir()
-    said = reading.read_run(tmp_path).missing
+    said = read([metrics_line(0, 1)]).missing
     assert f"{tmp_path / 'config.json'} is no file" in said
     assert f"{tmp_path / 'evaluation.json'} is missing" in said
 
@@ -137,22 +133,24 @@ HUGE = 10**400
     ],
 )
 def test_results_are_numbers(
-    tmp_path: Path, where: str, value: Any, said: str, evaluations: Any, good_line: Any
+    tmp_path: Path,
+    where: str,
+    value: Any,
+    said: str,
+    evaluations: Any,
+    metrics_line: Any,
+    read: Any,
 ) -> None:
+    results = evaluations()
+    corner = results["corner"]
+    (corner if where in corner else corner["tilt_deg"])[where] = value
+    (tmp_path / "evaluation.json").write_text(json.dumps(results))
+    (tmp_path / "seeds.json").write_text(json.dumps({"seeds": [{"evaluation": results}]}))
+    run = read([metrics_line(0, 1)])
+    assert run.results == []
     for name in ("evaluation.json", "seeds.json"):
-        results = evaluations()
-        results["corner"].update({where: value} if where in results["corner"] else {})
-        if where in results["corner"]["tilt_deg"]:
-            results["corner"]["tilt_deg"][where] = value
-        whole: Any = results if name == "evaluation.json" else {"seeds": [{"evaluation": results}]}
-        folder = tmp_path / name.removesuffix(".json")
-        folder.mkdir()
-        (folder / "metrics.jsonl").write_text(f"{good_line}\n")
-        (folder / name).write_text(json.dumps(whole))
-        run = reading.read_run(folder)
-        assert run.results == []
-        sentences = [sentence for sentence in run.missing if f"{name} cannot be used" in sentence]
-        assert said in sentences[0].replace(" of seeds[0]", "")
+        (sentence,) = [x for x in run.missing if f"{name} cannot be used" in x]
+        assert said in sentence.replace(" of seeds[0]", "")
 
 
 @pytest.mark.parametrize(
@@ -175,86 +173,74 @@ def test_results_are_numbers(
         ("seeds", {"eval/paper/tilt_mean": [HOSTILE]}),
     ],
 )
-def test_metrics_are_numbers(
-    tmp_path: Path, where: str, value: Any, metrics_line: Any, good_line: Any
-) -> None:
-    bad = metrics_line(1, 1) | {where: value}
-    (tmp_path / "metrics.jsonl").write_text(f"{good_line}\n{json.dumps(bad)}\n")
-    run = reading.read_run(tmp_path)
+def test_metrics_are_numbers(where: str, value: Any, metrics_line: Any, read: Any) -> None:
+    run = read([metrics_line(0, 1), metrics_line(1, 1) | {where: value}])
     assert len(run.metrics) == 1
     assert "metrics.jsonl is shown up to line 2, which cannot be used: " in "".join(run.missing)
 
 
-def test_seeds_that_change_along_the_way_are_refused(tmp_path: Path, metrics_line: Any) -> None:
-    lines = [metrics_line(0, 3), metrics_line(1, 2)]
-    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
-    run = reading.read_run(tmp_path)
+def test_seeds_that_change_along_the_way_are_refused(metrics_line: Any, read: Any) -> None:
+    run = read([metrics_line(0, 3), metrics_line(1, 2)])
     assert len(run.metrics) == 1
     assert "other seeds than in line 1" in "".join(run.missing)
 
 
-def test_validations_are_read_where_there_are_any(tmp_path: Path, metrics_line: Any) -> None:
+def test_validations_are_read_where_there_are_any(metrics_line: Any, read: Any) -> None:
     name = "eval/corner/tilt_mean"
     lines = [metrics_line(k, 2) for k in range(3)]
     lines[1] |= {name: 0.5, "eval/corner/falls": 1}
     lines[1]["seeds"] = lines[1]["seeds"] | {name: [0.5, None]}
     lines[2] |= {name: 0.25}
-    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
-    run = reading.read_run(tmp_path)
+    run = read(lines)
     assert [line.get(name) for line in run.metrics] == [None, 0.5, 0.25]
     np.testing.assert_array_equal(run.metrics[1]["seeds"][name], [0.5, np.nan])
     assert name not in run.metrics[2]["seeds"]
     assert "eval/corner/falls" not in run.metrics[1]
 
 
-def test_a_loss_that_is_no_number_is_a_gap(tmp_path: Path, metrics_line: Any) -> None:
+def test_a_loss_that_is_no_number_is_a_gap(metrics_line: Any, read: Any) -> None:
+    """And so is one that is missing, before the first update."""
     lines = [metrics_line(k, 2) for k in range(3)]
+    del lines[0]["train/loss"]
+    lines[0]["seeds"] = lines[0]["seeds"] | {"loss": [None, None]}
     lines[1]["train/loss"] = float("nan")
-    lines[1]["seeds"] = dict(lines[1]["seeds"], loss=[float("-inf"), 1.0])
-    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
-    run = reading.read_run(tmp_path)
-    assert len(run.metrics) == 3
-    assert np.isnan(run.metrics[1]["train/loss"])
-    np.testing.assert_array_equal(run.metrics[1]["seeds"]["loss"], [np.nan, 1.0])
+    lines[1]["seeds"] = lines[1]["seeds"] | {"loss": [float("-inf"), 1.0]}
+    run = read(lines)
+    assert not any("metrics" in sentence for sentence in run.missing)
+    np.testing.assert_array_equal([x["train/loss"] for x in run.metrics], [np.nan, np.nan, 1 / 3])
+    losses = [line["seeds"]["loss"] for line in run.metrics[:2]]
+    np.testing.assert_array_equal(losses, [[np.nan, np.nan], [np.nan, 1.0]])
 
 
 def test_of_long_metrics_the_beginning_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, metrics_line: Any
+    monkeypatch: pytest.MonkeyPatch, metrics_line: Any, read: Any
 ) -> None:
-    texts = [json.dumps(metrics_line(k, 1)) for k in range(4)]
-    monkeypatch.setattr(reading, "METRICS_BYTES", len("\n".join(texts[:3])) - 1)
-    (tmp_path / "metrics.jsonl").write_text("\n".join(texts))
-    run = reading.read_run(tmp_path)
+    lines = [metrics_line(k, 1) for k in range(4)]
+    monkeypatch.setattr(reading, "METRICS_BYTES", len("\n".join(map(json.dumps, lines[:3]))) - 1)
+    run = read(lines)
     assert [line["env_steps"] for line in run.metrics] == [1024, 2048], "the third is cut off"
     assert "metrics.jsonl is 0.0 MiB long; its first 0 MiB are shown" in "".join(run.missing)
 
 
 def test_only_what_the_report_shows_is_kept(
-    tmp_path: Path, metrics_line: Any, evaluation_result: Any
+    tmp_path: Path, metrics_line: Any, evaluation_result: Any, read: Any
 ) -> None:
     line = metrics_line(0, 2) | {"train/note": HOSTILE, "more": [HOSTILE]}
     line["seeds"] = {"loss": [1, 2.5], "note": [HOSTILE]}
-    (tmp_path / "metrics.jsonl").write_text(json.dumps(line))
-    result = evaluation_result("paper", 0.25) | {"note": HOSTILE}
+    result = evaluation_result("paper", 0.25) | {"note": HOSTILE, "falls": 8}
     (tmp_path / "evaluation.json").write_text(json.dumps({"paper": result}))
-    run = reading.read_run(tmp_path)
+    run = read([line])
     assert run.metrics[0]["seeds"] == {"loss": [1.0, 2.5]}
     assert run.metrics[0]["train/tilt_deg"] == 1.0
     tilt = {"mean": 0.25, "p95": 0.25, "max": 0.25}
-    expected = {"scenarios": 8, "falls": 1, "tilt_deg": tilt, "action_mm_settled": None}
+    expected = {"scenarios": 8, "falls": 8, "tilt_deg": tilt, "action_mm_settled": None}
     assert run.results == [{"paper": expected}]
     assert "<" not in repr((run.metrics, run.results))
 
 
-def test_an_evaluation_in_which_all_fell_is_one(evaluation_result: Any) -> None:
-    result = evaluation_result("paper", 6.0) | {"falls": 8}
-    assert reading.suite_results({"paper": result})["paper"]["falls"] == 8
-
-
-def test_metrics_without_a_line_are_said(tmp_path: Path) -> None:
+def test_metrics_without_a_line_are_said(tmp_path: Path, read: Any) -> None:
     (tmp_path / "config.json").write_text("{}")
-    (tmp_path / "metrics.jsonl").write_text("")
-    said = "\n".join(reading.read_run(tmp_path).missing)
+    said = "\n".join(read([]).missing)
     assert "metrics.jsonl cannot be used: it holds no line yet" in said
 
 
@@ -337,7 +323,7 @@ def test_a_damaged_folder_is_read_as_far_as_it_goes(
         assert all(isinstance(line[name], (int, float)) for name in line if name != "seeds")
     for results in run.results:
         assert results == reading.suite_results(results)
-    page.seeds_table(run, [run, run])
+    page.seeds_statistics(run, [run, run])
     shutil.rmtree(folder)
 
 
@@ -384,15 +370,3 @@ def test_a_flood_that_is_a_run_is_read_soon_and_in_little_memory(
     assert time.process_time() - began < 1
     assert len(run.metrics) > 8_000
     assert "its first 8 MiB are shown" in "".join(run.missing)
-
-
-def test_a_line_before_the_first_update_has_no_loss(tmp_path: Path, metrics_line: Any) -> None:
-    lines = [metrics_line(k, 2) for k in range(3)]
-    del lines[0]["train/loss"]
-    lines[0]["seeds"] = {name: [0.5, 0.5] for name in lines[0]["seeds"]} | {"loss": [None, None]}
-    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(x)}\n" for x in lines))
-    run = reading.read_run(tmp_path)
-    assert len(run.metrics) == 3
-    assert np.isnan(run.metrics[0]["train/loss"])
-    assert np.isnan(run.metrics[0]["seeds"]["loss"]).all()
-    assert not any("metrics" in sentence for sentence in run.missing)
