@@ -267,24 +267,14 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes commands and snippets quick, behind flags and config."""
     simulate, in_scene = evaluation.run_suite, evaluation.policy_scene
 
-    def few(scene: Any, controller: Any, suite: str, *sizes: Any, **keywords: Any) -> Any:
+    def few(scene: Any, controller: Any, suite: str, *sizes: Any, **more: Any) -> Any:
         scenarios, duration, *others = sizes
-        return simulate(scene, controller, suite, min(scenarios, 2), min(duration, 1.0), *others)
+        count, seconds = min(scenarios, 2), min(duration, 1.0)
+        return simulate(scene, controller, suite, count, seconds, *others, **more)
 
-    def found(policy: Any, robot: str | None = None) -> Any:
+    def scene_of(policy: Any, robot: str | None = None) -> Any:
         find_robot(robot or "quadruped")  # which the shipped policy was not trained for
         return in_scene(policy)
-
-    def drawn(path: Path, *_: Any) -> None:
-        path.write_bytes(b"")
-
-    def train(wanted: config.Config, *_: Any) -> None:
-        config.check(wanted)
-
-    def filmed(scene: Any, controller: Any, args: evaluate_command.EvaluateArgs) -> int:
-        assert args.video is not None
-        args.video.write_bytes(b"")
-        return 0
 
     def train_ppo(*arguments: Any, **keywords: Any) -> Any:
         given = trainer.bind(*arguments, **keywords).arguments
@@ -294,28 +284,25 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
     trainer = inspect.signature(ppo.train)
     first = types.SimpleNamespace(process_id=0)
-    monkeypatch.setattr(evaluate_command, "run_suite", few)
-    monkeypatch.setattr(evaluation, "policy_scene", found)
-    monkeypatch.setattr(render, "write", drawn)
     shut = types.SimpleNamespace(is_open=False, close=lambda: None)
-    monkeypatch.setattr(render, "Window", lambda *arguments: shut)
-    monkeypatch.setattr(run, "train", train)
-    monkeypatch.setattr(ppo, "train", train_ppo)
-    monkeypatch.setattr(train_command, "read_run_config", lambda path: config.preset("default"))
-    monkeypatch.setattr(evaluate_command, "_video", filmed)
-    monkeypatch.setattr(cluster, "find_cluster", lambda *where: first)
-    monkeypatch.setattr(report_page, "write_report", lambda *arguments: [])
-    # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
-    over_c = {"engine": "mujoco"}
-    monkeypatch.setattr(
-        env,
-        "make_engine",
-        lambda own, scene: make_engine(dataclasses.replace(own, **over_c), scene),
-    )
-    clock = Clock()
-    monkeypatch.setattr(time, "monotonic", clock.monotonic)
-    monkeypatch.setattr(time, "sleep", clock.sleep)
-    monkeypatch.setattr(runtime.Controller.__init__, "__defaults__", (clock.monotonic,))
+    clock, over_c = Clock(), {"engine": "mujoco"}
+    for owner, name, value in (
+        (evaluate_command, "run_suite", few),
+        (evaluation, "policy_scene", scene_of),
+        (render, "write", lambda path, *_: path.write_bytes(b"")),
+        (render, "Window", lambda *_: shut),
+        (run, "train", lambda wanted, *_: config.check(wanted)),
+        (ppo, "train", train_ppo),
+        (train_command, "read_run_config", lambda path: config.preset("default")),
+        (cluster, "find_cluster", lambda *_: first),
+        (report_page, "write_report", lambda *_: []),
+        # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
+        (env, "make_engine", lambda x, scene: make_engine(dataclasses.replace(x, **over_c), scene)),
+        (time, "monotonic", clock.monotonic),
+        (time, "sleep", clock.sleep),
+        (runtime.Controller.__init__, "__defaults__", (clock.monotonic,)),
+    ):
+        monkeypatch.setattr(owner, name, value)
 
 
 def name_of(page: Path) -> str:

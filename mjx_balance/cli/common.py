@@ -25,12 +25,7 @@ def complain(message: str, code: int = USAGE_ERROR) -> int:
 
 
 def check_out(name: str, path: Path | None, suffix: str = "") -> None:
-    """Checks before the work begins that an output file can be written.
-
-    Args:
-      name: of the flag.
-      path: of the file; None passes.
-      suffix: of the file's name; empty if any will do.
+    """Checks before the work begins that the output file of flag `name` can be written.
 
     Raises:
       InputError: if the suffix differs, the path is a folder, or its folder does not exist.

@@ -26,14 +26,10 @@ TILT_SECONDS, REST_SECONDS = 3.0, 1.0
 class TiltTest(NamedTuple):
     """The worst of four tilt tests: the board turns either way about each axis."""
 
-    torque_share: np.ndarray
-    """(legs, 3) greatest torque of each servo, as a share of its limit."""
-    tilt: float
-    """Greatest body tilt at the end, deg."""
-    creep: float
-    """Greatest mean speed of the trunk at rest, m/s: feet creep under regularised friction."""
-    qpos: np.ndarray
-    """(nq,) final state of the test with the greatest torque."""
+    torque_share: np.ndarray  # (legs, 3) greatest torque of each servo, as a share of its limit
+    tilt: float  # greatest body tilt at the end, deg
+    creep: float  # greatest mean speed of the trunk at rest, m/s: feet creep
+    qpos: np.ndarray  # (nq,) final state of the test with the greatest torque
 
 
 def inspect(robot: str) -> tuple[Scene, TiltTest]:

@@ -51,11 +51,8 @@ def sweep(argv: list[str]) -> int:
     count = next((k for k, text in enumerate(argv) if text.startswith("-")), len(argv))
     entries = []
     for text in argv[:count]:
-        if not text.startswith("@"):
-            entries.append(text)
-            continue
         try:
-            entries += Path(text[1:]).read_text().split()
+            entries += Path(text[1:]).read_text().split() if text.startswith("@") else [text]
         except (OSError, UnicodeDecodeError) as error:
             return complain(f"the values in {text[1:]} cannot be read: {error}")
     if not entries and not {"--resume", *HELP} & set(argv):

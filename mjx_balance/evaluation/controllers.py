@@ -27,22 +27,14 @@ SWEEPS = 25
 class View(NamedTuple):
     """What n scenarios of an evaluation show before a decision; a policy looks at `obs` alone."""
 
-    ids: np.ndarray
-    """(n,) numbers of these scenarios in the batch, for controllers with a memory."""
-    env_steps: int
-    """Decisions since the start."""
-    obs: np.ndarray
-    """(n, obs_size) the network's input."""
-    imu: np.ndarray
-    """(n, sim_steps, 6) IMU samples of the last decision."""
-    qpos: np.ndarray
-    """(n, nq) true positions."""
-    qvel: np.ndarray
-    """(n, nv) true velocities."""
-    scenario: tilt.Scenario
-    """Where the boards go."""
-    delayed: np.ndarray
-    """(n,) whether actions are taken one decision later."""
+    ids: np.ndarray  # (n,) numbers of these scenarios in the batch, for controllers with a memory
+    env_steps: int  # decisions since the start
+    obs: np.ndarray  # (n, obs_size) the network's input
+    imu: np.ndarray  # (n, sim_steps, 6) IMU samples of the last decision
+    qpos: np.ndarray  # (n, nq) true positions
+    qvel: np.ndarray  # (n, nv) true velocities
+    scenario: tilt.Scenario  # where the boards go
+    delayed: np.ndarray  # (n,) whether actions are taken one decision later
 
 
 Controller = Callable[[View], np.ndarray]
@@ -66,8 +58,7 @@ def measure_response(scene: Scene) -> Response:
     """Takes one action on each axis, on the level board, and watches the body."""
     task = scene.config.task
     change = task.action_max / 2 * np.eye(ACTION_AXES)
-    axes = np.arange(ACTION_AXES)
-    still = np.zeros(ACTION_AXES)
+    axes, still = np.arange(ACTION_AXES), np.zeros(ACTION_AXES)
     level = tilt.Scenario(np.zeros((ACTION_AXES, 1, 2)), still, still + task.board_rate)
     env, angles = BatchEnv(scene, Episodes(level), threads=1), []
     for number in range(HORIZON):

@@ -66,18 +66,12 @@ class Seeds:
     Training draws from other generators and sees none of them.
     """
 
-    final: int = 1_000_000
-    """Evaluation after training."""
-    record: int = 2_000_000
-    """Rollouts drawn as figures."""
-    validation: int = 3_000_000
-    """Choice among several training seeds; never reported."""
-    report: int = 4_000_000
-    """Policy against baselines, in a report."""
-    tuning: int = 5_000_000
-    """Gains of the baselines."""
-    held_out: int = 7_000_000
-    """Published results."""
+    final: int = 1_000_000  # evaluation after training
+    record: int = 2_000_000  # rollouts drawn as figures
+    validation: int = 3_000_000  # choice among several training seeds; never reported
+    report: int = 4_000_000  # policy against baselines, in a report
+    tuning: int = 5_000_000  # gains of the baselines
+    held_out: int = 7_000_000  # published results
 
 
 SEEDS = Seeds()

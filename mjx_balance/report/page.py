@@ -36,12 +36,9 @@ CONSTANTS = {
 
 
 def write_report(
-    run_dirs: Sequence[Path],
-    out: Path,
-    scenarios: int,
-    progress: Callable[[str], Any],
+    run_dirs: Sequence[Path], out: Path, scenarios: int, progress: Callable[[str], Any]
 ) -> list[str]:
-    """Writes one self-contained HTML file.
+    """Writes one self-contained HTML file; returns what is missing, one sentence each.
 
     It compares the first run that has a policy with the baselines, on scenarios of the report's
     own seed, and saves these results in the run folder (`report.json`).
@@ -51,9 +48,6 @@ def write_report(
       out: file to write.
       scenarios: per suite and controller.
       progress: title -> context manager that gives a callable taking the share done.
-
-    Returns:
-      What is missing, one sentence each.
 
     Raises:
       ReportError: for a folder that is no run folder.
@@ -102,11 +96,7 @@ def render_page(page: dict[str, Any]) -> str:
 def _policy_sections(
     run: Run, policy: Policy, runs: Sequence[Run], scenarios: int, progress: Callable[[str], Any]
 ) -> dict[str, Any]:
-    """The page's values about a run's policy, but for the video.
-
-    Raises:
-      PolicyError: if the policy belongs to another scene.
-    """
+    """The page's values about a run's policy, but for the video."""
     scene, file = policy_scene(policy), RunFolder(run.path).report
     measurements = measuring.load_or_measure(policy, scene, file, scenarios, progress)
     return {
@@ -123,10 +113,11 @@ def seeds_statistics(run: Run, runs: Sequence[Run]) -> dict[str, dict[str, Any]]
     Empty if there are fewer than two seeds.
     """
 
-    def recipe(any_run: Run) -> Config | None:
-        return any_run.config and dataclasses.replace(any_run.config, seed=0, num_seeds=1)
+    def recipe(config: Config | None) -> Config | None:
+        return config and dataclasses.replace(config, seed=0, num_seeds=1)
 
-    alike = [x for x in runs if x is run or (x.config and recipe(x) == recipe(run))]
+    own = recipe(run.config)
+    alike = [x for x in runs if x is run or (own is not None and recipe(x.config) == own)]
     each = [result for x in alike for result in x.results]
     if len(each) < 2:
         return {}
@@ -135,19 +126,12 @@ def seeds_statistics(run: Run, runs: Sequence[Run]) -> dict[str, dict[str, Any]]
 
 
 def policy_pictures(policy: Policy, scene: Scene, measurements: Measurements) -> dict[str, str]:
-    """The paper's Fig. 7 for each suite, the distribution of the tilt, and the envelope.
-
-    Returns:
-      Suite, `tilt` or `envelope` -> PNG in base64.
-    """
+    """The paper's Fig. 7 by suite, the tilt's distribution and the envelope: PNGs in base64."""
     fail_tilt, pictures = policy.config.task.fail_tilt, {}
+    record, seconds = measuring.record_rollout, measuring.RECORD_SECONDS
     for suite in HEADLINE:
-        rollouts = {
-            name: measuring.record_rollout(
-                policy, suite, measuring.RECORD_SECONDS, SEEDS.record, name
-            )
-            for name in ("policy", "pd-imu")
-        }
+        names = ("policy", "pd-imu")
+        rollouts = {x: record(policy, suite, seconds, SEEDS.record, x) for x in names}
         pictures[suite] = _picture(figures.rollout_figure(scene, rollouts))
     shares = {name: np.asarray(suites["paper"]) for name, suites in measurements.shares.items()}
     tilt = figures.tilt_figure(shares, measuring.edges(fail_tilt))

@@ -203,7 +203,7 @@ def test_evaluate_writes_figures_and_a_video(
     who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, read_video: Any
 ) -> None:
     """0.4 s of a baseline and of a policy, to the end of the command."""
-    args = {"controller": "pd-imu"} if who == "controller" else {"policy": SHIPPED}
+    args: Any = {"controller": "pd-imu"} if who == "controller" else {"policy": SHIPPED}
     names = ("--controller", "pd-imu") if who == "controller" else (str(SHIPPED),)
     flags = "--suite corner --scenarios 2 --duration 0.4 --seed 5 --json out.json --video v.mp4"
     code = main(("evaluate", *names, *flags.split()))

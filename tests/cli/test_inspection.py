@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from mjx_balance.cli.inspection import TiltTest, describe, inspect, problems, tilt_board
-from mjx_balance.config import ConfigError
 from mjx_balance.robots.measure import UNLIMITED
 from mjx_balance.sim.scene import Scene
 
@@ -123,8 +122,3 @@ def test_places_are_seen_from_the_trunks_origin(spot: tuple[Scene, TiltTest]) ->
     robot = dataclasses.replace(scene.robot, legs=tuple(legs))
     lines = describe(dataclasses.replace(scene, robot=robot), got)
     assert "RL  hind left   foot 102 mm ahead, 166 mm to the left" in lines[6]
-
-
-def test_what_cannot_be_built_is_said() -> None:
-    with pytest.raises(ConfigError, match="robot is 'rex'"):
-        inspect("rex")

@@ -186,7 +186,7 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
 
     rollout = roll_out(scene, act, Episodes(scenarios, conditions), 1.2, record=True)
     expected = np.asarray([world.qpos for world in worlds])
-    np.testing.assert_allclose(rollout.qpos, expected, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(rollout.qpos), expected, atol=1e-9)
     np.testing.assert_allclose(rollout.tilt, [tilts(scene, x) for x in expected], atol=1e-5)
     assert 1 < rollout.tilt.max() < 6
     levels = np.stack(np.divmod(actions.T, 21))
@@ -217,7 +217,7 @@ def test_pushes_come_between_a_choice_and_its_decision(config: Config, scene: Sc
     pushes = Pushes(velocity, np.asarray([(1, 4), (1, 4)]))
     rollout = roll_out(scene, act, Episodes(scenarios, pushes=pushes), 1.2, record=True)
     assert not rollout.fell.any()
-    np.testing.assert_allclose(rollout.qpos, [world.qpos for world in worlds], atol=1e-9)
+    np.testing.assert_allclose(np.asarray(rollout.qpos), [x.qpos for x in worlds], atol=1e-9)
 
 
 def test_who_stands_gets_its_own_push_when_others_have_fallen(config: Config, scene: Scene) -> None:
