@@ -43,9 +43,8 @@ with quiet_imports("torch"):
     from mjx_balance.dqn.dqn import reset_done
     from mjx_balance.dqn.mesh import REPLICATED, device_key, mean_over_devices, on_each_device
     from mjx_balance.envs.balance import BalanceEnv
-    from mjx_balance.training import processes as run_processes
     from mjx_balance.training import program_cache, sizing
-    from mjx_balance.training.cluster import Cluster
+    from mjx_balance.training.processes import Cluster, joined
 from mjx_balance.sim.scene import Scene, load_scene
 
 DECISIONS_PER_CALL = 2_048
@@ -250,7 +249,7 @@ def process_row(cluster: Any, engine: str, num_envs: int, batches: int, rounds: 
         step = lambda x, _: (mean_over_devices(x + 1), None)  # noqa: E731
         return jax.lax.scan(step, x, length=EXCHANGES)[0]
 
-    with run_processes.joined(cluster, ()) as us:
+    with joined(cluster) as us:
         config, learner = make_learner(engine=engine, num_envs=num_envs, dqn=dqn)
         gradients = jnp.zeros(len(ravel_pytree(learner.init(0).params)[0]) + 1)  # and the loss
         specs = {"in_specs": REPLICATED, "out_specs": REPLICATED}

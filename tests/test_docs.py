@@ -41,7 +41,7 @@ from mjx_balance.report import page as report_page
 from mjx_balance.robots.catalogue import find_robot, shipped
 from mjx_balance.robots.schema import LegFile, RobotFile, parse_robot_file
 from mjx_balance.sim.engines.table import make_engine
-from mjx_balance.training import cluster, run
+from mjx_balance.training import processes, run
 
 REPO = Path(__file__).resolve().parent.parent
 DOCS = REPO / "docs"
@@ -294,7 +294,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         (run, "train", lambda wanted, *_: config.check(wanted)),
         (ppo, "train", train_ppo),
         (train_command, "read_run_config", lambda path: config.preset("default")),
-        (cluster, "find_cluster", lambda *_: first),
+        (processes, "find_cluster", lambda *_: first),
         (report_page, "write_report", lambda *_: []),
         # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
         (env, "make_engine", lambda x, scene: make_engine(dataclasses.replace(x, **over_c), scene)),

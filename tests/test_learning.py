@@ -1,12 +1,14 @@
-"""Learning on the real env, and the programs of presets too long to run here."""
+"""Learning on the real env, and the programs of presets and accelerators not to be run here."""
 
 import dataclasses
+import re
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 
 from mjx_balance.config import Config, preset
 from mjx_balance.envs import balance as env_module
@@ -166,7 +168,8 @@ def test_every_presets_program_fits_its_state(
     learner = make_learner(config, BalanceEnv(config))
     before = jax.eval_shape(lambda: learner.init(0))
     after, metrics = jax.eval_shape(learner.train_program(2), before)
-    jax.tree.map(lambda a, b: check_same(a, b), before, after)
+    shapes_of = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    assert shapes_of(before) == shapes_of(after)
     layers = before.params["params"]
     shapes = [layers[layer]["kernel"].shape for layer in ("hidden_0", "hidden_1", "head")]
     assert shapes == kernels
@@ -176,5 +179,20 @@ def test_every_presets_program_fits_its_state(
     assert expected <= set(metrics)
 
 
-def check_same(a: Any, b: Any) -> None:
-    assert (a.shape, a.dtype) == (b.shape, b.dtype)
+KERNELS = {
+    "cuda": {"cusolver_potrf_ffi", "cusolver_syevd_ffi"},
+    "tpu": {"Eigh"},
+}
+"""Platform -> custom calls of its own: MJX's Cholesky, and the whitening's eigenvalues."""
+
+
+@pytest.mark.parametrize("platform", KERNELS)
+def test_the_training_program_is_lowered(platform: str) -> None:
+    config = size_to_device(dataclasses.replace(preset("smoke"), num_envs=2_048, num_devices=1))
+    learner = make_learner(config, BalanceEnv(config))
+    program: Any = learner.train_program(2)
+    state = jax.eval_shape(lambda: learner.init(0))
+    exported = export.export(program, platforms=[platform])(state)
+    assert exported.platforms == (platform,)
+    calls = set(re.findall(r"custom_call @(\w+)", exported.mlir_module()))
+    assert calls - {"Sharding", "SPMDFullToShardShape", "SPMDShardToFullShape"} == KERNELS[platform]

@@ -93,7 +93,7 @@ def _train(args: TrainArgs) -> int:
 
     from mjx_balance.report.progress import Display
     from mjx_balance.training import run, sizing
-    from mjx_balance.training.cluster import find_cluster
+    from mjx_balance.training.processes import find_cluster
 
     display = Display()
     try:

@@ -1,7 +1,7 @@
 """Saves and restores the whole training state with orbax, whole or not at all.
 
-A checkpoint is a folder named by the decisions made, `state/` in it as orbax writes it, and
-a sum over those files: a damaged one is found out before anything is read from it.
+A checkpoint is a folder named by the decisions so far, with orbax's files in `state/` and a
+checksum of them in `sum`, which is compared before anything is read.
 """
 
 import hashlib
@@ -19,8 +19,8 @@ from mjx_balance.training.processes import ALONE, Processes
 
 T = TypeVar("T")
 
-KEPT = 2
-"""Newest checkpoints that are kept: one, and one to fall back on."""
+NEWEST = 2
+"""Checkpoints that stay: one, and one to fall back on."""
 
 
 class CheckpointError(InputError):
@@ -28,15 +28,9 @@ class CheckpointError(InputError):
 
 
 def save(directory: Path, env_steps: int, state: object, processes: Processes = ALONE) -> None:
-    """Writes a checkpoint; does nothing if it is already there.
+    """Writes a checkpoint of a pytree of arrays, unless there is one after so many decisions.
 
     Every process writes its own part of the state; the first one does the rest.
-
-    Args:
-      directory: of all checkpoints of a run.
-      env_steps: decisions so far.
-      state: a pytree of arrays.
-      processes: that share the state.
 
     Raises:
       CheckpointError: if it cannot be written; those before it stay.
@@ -54,15 +48,14 @@ def save(directory: Path, env_steps: int, state: object, processes: Processes = 
     def end() -> None:
         (part / "sum").write_text(_sum(part / "state"))
         part.rename(path)
-        for stale in saved_steps(directory)[:-KEPT]:
+        for stale in saved_steps(directory)[:-NEWEST]:
             shutil.rmtree(directory / str(stale))
 
     try:
-        if not processes.broadcast(begin, OSError):
-            return
-        with _checkpointer() as checkpointer:
-            checkpointer.save((part / "state").resolve(), state)
-        processes.broadcast(end, OSError)
+        if processes.broadcast(begin, OSError):
+            with _checkpointer() as checkpointer:
+                checkpointer.save((part / "state").resolve(), state)
+            processes.broadcast(end, OSError)
     except Exception as error:  # whatever orbax raises on a full disk, say
         reason = shorten(error, MESSAGE)
         raise CheckpointError(f"the checkpoint {path} cannot be written: {reason}") from error
@@ -71,17 +64,15 @@ def save(directory: Path, env_steps: int, state: object, processes: Processes = 
 def restore(
     directory: Path, like: T, log_fn: Callable[[str], None], processes: Processes = ALONE
 ) -> T | None:
-    """Reads the newest checkpoint that is whole.
+    """Reads the newest checkpoint that is whole; None if none was ever saved.
+
+    Damaged ones are logged, and removed if an older one is whole: the run will come by there again.
 
     Args:
       directory: of all checkpoints of a run.
-      like: a state with the structure, shapes, dtypes and shardings wanted.
-      log_fn: told of every damaged one; once a whole one is found, they are removed, as the
-        run will come by there again.
+      like: a state of the same structure, shapes, dtypes and shardings.
+      log_fn: takes a line for the user.
       processes: that share the state, as many as they now are.
-
-    Returns:
-      The state, or none if none was ever saved.
 
     Raises:
       CheckpointError: if there are checkpoints, but none is whole.
@@ -110,7 +101,6 @@ def saved_steps(directory: Path) -> list[int]:
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a checkpoint's files have the sum that they were written with."""
     try:
         return (path / "sum").read_bytes() == _sum(path / "state").encode()
     except OSError:
@@ -118,7 +108,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def _read(path: Path, like: T) -> T | None:
-    """One checkpoint, or none if it is of another structure."""
+    """One checkpoint, or None if it has another structure."""
     try:
         with _checkpointer() as checkpointer:
             return cast(T, checkpointer.restore((path / "state").resolve(), like))
@@ -129,11 +119,10 @@ def _read(path: Path, like: T) -> T | None:
 def _sum(folder: Path) -> str:
     """Digest of all files of a folder, their names included."""
     digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
-        if path.is_file():
-            digest.update(str(path.relative_to(folder)).encode() + b"\0")
-            with path.open("rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(str(path.relative_to(folder)).encode() + b"\0")
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
 
 

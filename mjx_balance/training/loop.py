@@ -1,29 +1,29 @@
-"""The loop of a run: calls of the compiled program, what they log, when they are saved."""
+"""The loop of a run: calls of the compiled program, metrics, checkpoints, interrupts."""
 
 import atexit
+import dataclasses
 import json
 import math
-import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
 from mjx_balance.config import Config, expand_runs
-from mjx_balance.dqn import TrainState
+from mjx_balance.dqn import DQN, TrainState
+from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.envs.metrics import Metric
 from mjx_balance.files.run_folder import RunFolder, keep_metrics_until, keep_validated_until
 from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints
-from mjx_balance.training.processes import ALONE, Processes
+from mjx_balance.training.processes import ALONE, Processes, exit_at_once
 
 T = TypeVar("T")
 
@@ -35,71 +35,56 @@ LEARNER_METRICS = {
 """The learner's own metrics; an env's table is added to them."""
 ANSWER_S = 0.2
 """Longest time that the user waits for an answer to an interrupt, s."""
+STOPPING = (
+    "stopping after this call and saving; interrupt again to quit at once, without what was "
+    "learnt since the last checkpoint"
+)
 
 Program = Callable[[TrainState], tuple[TrainState, Mapping[str, jax.Array]]]
-"""A compiled call: many decisions of every env, and the means of what was measured."""
-Write = Callable[[TrainState, dict[str, float], dict[str, Any]], None]
-"""Takes what a call measured: over all seeds, and of each."""
+"""A compiled call: many decisions of every env, and the means of its metrics."""
 Validate = Callable[[TrainState], Mapping[str, np.ndarray]]
-"""Tries the greedy policies of a state; what came of it by logged names, one value per seed."""
+"""Validates the greedy policies of a state: logged name -> one value per seed."""
 
 
-class Plan(NamedTuple):
-    """A run as its loop sees it: plain numbers."""
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run: what learns, where it is shown and saved."""
 
-    num_envs: int
-    num_seeds: int
-    iterations: int
-    """Decisions of every env per call of the program."""
-    total: int
-    """Decisions at which the run ends, all envs of one seed, in whole calls."""
-    decision_s: float
-    """Length of a decision, s."""
-    sim_steps: int
-    """Physics steps per decision."""
-    eval_every: int
-    """Decisions of one seed's envs between two validations; 0: never."""
-    checkpoint_seconds: float
-    """Time between two checkpoints, s."""
-    metrics: Mapping[str, Metric]
-    """Metrics that are logged otherwise than as a mean under their own name."""
+    config: Config
+    """Sized to the devices."""
+    env: BalanceEnv
+    learner: DQN
+    folder: RunFolder
+    display: Display
+    processes: Processes = ALONE
+
+    @property
+    def num_seeds(self) -> int:
+        """Runs in one program, the combinations of a sweep included."""
+        return len(expand_runs(self.config))
+
+    @property
+    def iterations(self) -> int:
+        """Decisions of every env per call of the program."""
+        return max(1, self.config.log_every // self.learner.spec.num_envs)
 
     @property
     def per_call(self) -> int:
-        """Decisions of one seed's envs in one call."""
-        return self.iterations * self.num_envs
+        """Decisions of one seed's envs per call."""
+        return self.iterations * self.learner.spec.num_envs
 
-
-def make_plan(config: Config, metrics: Mapping[str, Metric]) -> Plan:
-    """The plan of a run whose config is sized to its devices, and whose env has these metrics."""
-    assert config.num_envs is not None
-    iterations = max(1, config.log_every // config.num_envs)
-    per_call = iterations * config.num_envs
-    return Plan(
-        num_envs=config.num_envs,
-        num_seeds=len(expand_runs(config)),
-        iterations=iterations,
-        total=-(-config.num_env_steps // per_call) * per_call,
-        decision_s=config.task.ctrl_dt,
-        sim_steps=config.task.sim_steps,
-        eval_every=config.eval_every,
-        checkpoint_seconds=config.checkpoint_seconds,
-        metrics=LEARNER_METRICS | dict(metrics),
-    )
+    @property
+    def total(self) -> int:
+        """Decisions of one seed's envs at the end of the run, in whole calls."""
+        return -(-self.config.num_env_steps // self.per_call) * self.per_call
 
 
 class Interrupts:
-    """Interrupts of the user, collected so that the loop can stop between two calls.
-
-    The first is answered at once and asks the loop to stop; a second one raises
-    KeyboardInterrupt, which loses what was learnt since the last checkpoint.
-    """
+    """Interrupts of the user: the first asks the loop to stop, a second one raises at once."""
 
     def __init__(self, log_fn: Callable[[str], None]):
         """Answers by `log_fn`; use as a context."""
-        self._log_fn = log_fn
-        self._received = 0
-        self._answered = False
+        self._log_fn, self._received, self._answered = log_fn, 0, False
 
     def __bool__(self) -> bool:
         """Whether there was one."""
@@ -117,8 +102,8 @@ class Interrupts:
     def run(self, call: Callable[..., T], *arguments: Any) -> T:
         """Runs a call that may take a minute, and answers an interrupt meanwhile.
 
-        It runs in a thread of its own: Python handles no signal while the main thread is in
-        a compiled program.
+        The call has a thread of its own: Python handles no signal while the main thread is in a
+        compiled program.
         """
         future: Future[T] = Future()
 
@@ -138,75 +123,47 @@ class Interrupts:
             except KeyboardInterrupt:
                 atexit.register(_leave, future)
                 raise
-            self._answer()
+            if self and not self._answered:  # not in the handler, which may interrupt a print
+                self._answered = True
+                self._log_fn(STOPPING)
 
     def _receive(self, number: int, frame: object) -> None:
         self._received += 1
         if self._received > 1:
             raise KeyboardInterrupt
 
-    def _answer(self) -> None:
-        if self._received and not self._answered:
-            self._answered = True
-            self._log_fn(
-                "stopping after this call and saving; interrupt again to quit at once, without "
-                "what was learnt since the last checkpoint"
-            )
-
 
 def _leave(call: Future[Any]) -> None:
-    """Ends the process at its exit if a call still runs: with it, Python would abort."""
+    """Ends the process at its exit if a call still runs, with which Python would abort."""
     if not call.done():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(128 + signal.SIGINT)
+        exit_at_once(128 + signal.SIGINT)
 
 
 def learn(
-    plan: Plan,
-    program: Program,
-    state: TrainState,
-    folder: RunFolder,
-    display: Display,
-    stop: Interrupts,
-    validate: Validate,
-    processes: Processes = ALONE,
+    run: Run, program: Program, state: TrainState, stop: Interrupts, validate: Validate
 ) -> tuple[TrainState, float]:
     """Calls the program until the last decision or until the user stops; saves either way.
 
-    Every call is logged, with the validation that is due after it: it is made before its line
-    and before a checkpoint, so that a run that is resumed has neither missed it nor logs it
-    twice. What the folder has logged or validated after the state's decisions is dropped first.
-
-    Of several processes all call the program and save; the first one logs, shows and validates.
-    They stop together, whichever of them is interrupted.
-
-    Args:
-      plan: of the run.
-      program: compiled.
-      state: to go on from.
-      folder: to log and save into.
-      display: shows what is logged.
-      stop: whether the user interrupts.
-      validate: tries the greedy policies, when the plan says so.
-      processes: that share the state.
+    A validation comes before the line of metrics and the checkpoint of its call, so that a resumed
+    run neither misses it nor logs it twice. Of several processes all call the program and save;
+    the first one logs, shows and validates. An interrupt of one stops all.
 
     Returns:
       The last state, and the seconds spent learning by this call, validations apart.
     """
-    done = number(state.env_steps)
+    any_process, done = run.processes.any, number(state.env_steps)
     seconds = validating = 0.0
     saved_at = time.monotonic()
-    with _journal(plan, folder, display, done) if processes.first else nullcontext() as write:
-        while done < plan.total and not stop.run(processes.any, bool(stop)):
+    with _journal(run, done) if run.processes.first else nullcontext() as write:
+        while done < run.total and not stop.run(any_process, bool(stop)):
             before, began = done, time.perf_counter()
-            state, raw = stop.run(_finished, program, state)
+            state, raw = stop.run(_call, program, state)
             elapsed = time.perf_counter() - began
             seconds += elapsed
             done = number(state.env_steps)
             if write is not None:
-                metrics, seeds = measured(raw, elapsed, plan)
-                if validation_due(plan, before, done):
+                metrics, seeds = measured(run, raw, elapsed)
+                if validation_due(run, before, done):
                     began = time.perf_counter()
                     held_out = stop.run(validate, state)
                     validating += time.perf_counter() - began
@@ -214,54 +171,45 @@ def learn(
                     metrics["perf/validation_share"] = validating / (seconds + validating)
                     seeds |= listed(held_out)
                 write(state, metrics, seeds)
-            if stop.run(processes.any, time.monotonic() - saved_at >= plan.checkpoint_seconds):
-                checkpoints.save(folder.checkpoints, done, state, processes)
+            due = time.monotonic() - saved_at >= run.config.checkpoint_seconds
+            if stop.run(any_process, due):
+                checkpoints.save(run.folder.checkpoints, done, state, run.processes)
                 saved_at = time.monotonic()
-    checkpoints.save(folder.checkpoints, done, state, processes)
+    checkpoints.save(run.folder.checkpoints, done, state, run.processes)
     return state, seconds
 
 
 @contextmanager
-def _journal(plan: Plan, folder: RunFolder, display: Display, done: int) -> Iterator[Write]:
-    """Writes what a call measured into the folder, and shows it."""
+def _journal(run: Run, done: int) -> Iterator[Callable[..., None]]:
+    """Logs and shows the calls after `done` decisions; drops newer lines and policies first."""
+    folder = run.folder
     keep_metrics_until(folder.metrics, done)
     keep_validated_until(folder.validated, done)
-    with (
-        folder.metrics.open("a") as log,
-        _board(folder, done) as board,
-        display.training(done, plan.total),
-    ):
+    board = SummaryWriter(  # whatever other files have after `done` no longer counts
+        str(folder.tensorboard), purge_step=done + 1, filename_suffix=f".from-{done}"
+    )
+    with folder.metrics.open("a") as log, board, run.display.training(done, run.total):
 
         def write(state: TrainState, metrics: dict[str, float], seeds: dict[str, Any]) -> None:
-            done = number(state.env_steps)
-            line: dict[str, Any] = {"env_steps": done}
-            line |= {"gradient_steps": number(state.gradient_steps)} | metrics
-            if plan.num_seeds > 1:
-                line["seeds"] = seeds
-            log.write(json.dumps(line) + "\n")
+            steps = {name: number(getattr(state, name)) for name in ("env_steps", "gradient_steps")}
+            by_seed = {"seeds": seeds} if run.num_seeds > 1 else {}
+            log.write(json.dumps(steps | metrics | by_seed) + "\n")
             log.flush()
             for name, value in metrics.items():
-                board.add_scalar(name, value, done)
-            display.update(done, metrics)
+                board.add_scalar(name, value, steps["env_steps"])
+            run.display.update(steps["env_steps"], metrics)
 
         yield write
 
 
-def validation_due(plan: Plan, before: int, done: int) -> bool:
+def validation_due(run: Run, before: int, done: int) -> bool:
     """Whether a call from `before` to `done` decisions passes a validation, or ends the run."""
-    if not plan.eval_every:
-        return False
-    return done // plan.eval_every > before // plan.eval_every or done >= plan.total
+    every = run.config.eval_every
+    return every > 0 and (done // every > before // every or done >= run.total)
 
 
-def _board(folder: RunFolder, done: int) -> SummaryWriter:
-    """A TensorBoard file, which says that whatever others have after `done` no longer counts."""
-    suffix = f".from-{done}"
-    return SummaryWriter(str(folder.tensorboard), purge_step=done + 1, filename_suffix=suffix)
-
-
-def _finished(program: Program, state: TrainState) -> tuple[TrainState, Mapping[str, np.ndarray]]:
-    """Calls the program and waits for what it gives; the measurements come to the host."""
+def _call(program: Program, state: TrainState) -> tuple[TrainState, Mapping[str, np.ndarray]]:
+    """Calls the program and waits for its results; the metrics come to the host."""
     state, raw = jax.block_until_ready(program(state))
     return state, jax.device_get(raw)
 
@@ -272,43 +220,40 @@ def number(count: jax.Array) -> int:
 
 
 def measured(
-    raw: Mapping[str, np.ndarray], seconds: float, plan: Plan
+    run: Run, raw: Mapping[str, np.ndarray], seconds: float
 ) -> tuple[dict[str, float], dict[str, list[float | None]]]:
-    """The metrics of a call under their logged names.
+    """The metrics of a call under their logged names: the `means` of all, and some `listed`.
 
     Args:
-      raw: means over the call's decisions, one per seed if there are several; NaN without a
-        value, as the loss before the first update.
+      run: whose env and learner say how their metrics are logged.
+      raw: means over the call's decisions, () or (num_seeds,); NaN without a value, as the loss
+        before the first update.
       seconds: duration of the call.
-      plan: of the run.
-
-    Returns:
-      The `means` of all metrics, and those per seed `listed`.
     """
-    scale = {"decision": 1.0, "minute": 60 / plan.decision_s, "call": plan.per_call}
-    values: dict[str, np.ndarray] = {}
-    per_seed = {}
+    rows = LEARNER_METRICS | dict(run.env.metrics)
+    scale = {"decision": 1.0, "minute": 60 / run.config.task.ctrl_dt, "call": run.per_call}
+    values, per_seed = {}, {}
     for name, value in raw.items():
-        metric = plan.metrics.get(name, Metric())
+        metric = rows.get(name, Metric())
         logged = metric.name or name
         values[logged] = scale[metric.per] * np.atleast_1d(np.asarray(value, float))
         if metric.per_seed:
             per_seed[logged] = values[logged]
     metrics = {f"train/{name}": value for name, value in means(values).items()}
-    rate = plan.num_seeds * plan.per_call / seconds
+    rate = run.num_seeds * run.per_call / seconds
     metrics["perf/env_steps_per_second"] = rate
-    metrics["perf/physics_steps_per_second"] = rate * plan.sim_steps
+    metrics["perf/physics_steps_per_second"] = rate * run.config.task.sim_steps
     return metrics, listed(per_seed)
 
 
 def means(values: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Means over the seeds that have a value, without those that none has."""
+    """Means over the seeds that have a value; metrics missing for every seed are dropped."""
     known = {name: value[np.isfinite(value)] for name, value in values.items()}
     return {name: float(value.mean()) for name, value in known.items() if value.size}
 
 
 def listed(values: Mapping[str, np.ndarray]) -> dict[str, list[float | None]]:
-    """The values of every seed, None for one without, less those that no seed has."""
+    """Per-seed values, None where missing; metrics missing for every seed are dropped."""
     return {
         name: [x if math.isfinite(x) else None for x in value.tolist()]
         for name, value in values.items()

@@ -1,9 +1,8 @@
 """How the processes of a run meet before JAX connects their devices, and notice one that dies.
 
-JAX does both by aborting with a native stack trace, which nothing in Python can catch:
-`jax.distributed.initialize` where a process never comes, its coordination service in all others
-where process 0 dies. So every process first connects to process 0, says who it is, gets one line
-back, and keeps the connection: it ends when the process at its other end does.
+In both cases JAX aborts with a native stack trace, which Python cannot catch. So every process
+first connects to process 0, says who it is, gets one line back, and keeps the connection: it ends
+when the process at its other end does.
 """
 
 import contextlib
@@ -20,50 +19,47 @@ from mjx_balance.errors import FAILED, InputError
 from mjx_balance.files.text import MESSAGE, shorten
 
 PROGRAM = "mjx_balance"
-"""What a process of ours says first, within 5 s; whoever does not is a stranger."""
-LINE_BYTES, THREADS = 2**16, 100
+"""What a process of ours says first, within `HELLO_S`; whoever does not is a stranger."""
+HELLO_S, LINE_BYTES, THREADS = 5, 2**16, 100
 """Longest line that is read; from so many threads on, connections wait to be asked."""
 KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 4, "TCP_USER_TIMEOUT": 30_000}
 """A machine that answers nothing counts as gone after 30 s."""
+Meeting = tuple[dict[int, socket.socket], list[Any]]
+"""The connections to other processes by their index, and what all say about themselves."""
 
 
 class ProcessError(InputError):
     """Processes that cannot work together; the message says why."""
 
 
-def host(
-    address: tuple[str, int], count: int, about: Any, patience_s: float
-) -> tuple[dict[int, socket.socket], list[Any]]:
-    """Waits, as process 0, for all others.
+def host(address: tuple[str, int], count: int, about: Any, patience_s: float) -> Meeting:
+    """Waits, as process 0 of `count`, for all others; listens at this IP and port alone.
 
     Args:
-      address: IP and port to listen at; nothing listens anywhere else.
+      address: IP and port.
       count: number of processes.
       about: JSON value that all get to know of this one.
-      patience_s: time to wait, s.
-
-    Returns:
-      The connections to the others by their index, and `about` of all.
+      patience_s: longest time to wait, s.
 
     Raises:
       ProcessError: in every process that has come, if another does not, or counts differently.
     """
     where, until = f"{address[0]} port {address[1]}", time.monotonic() + patience_s
     connections: dict[int, socket.socket] = {}
-    abouts = {0: about}
+    abouts, refusal = {0: about}, ""
     hellos: queue.SimpleQueue[tuple[socket.socket, int, int, Any]] = queue.SimpleQueue()
-    refusal = ""
     try:
-        family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        server = socket.create_server(address, family=family)
+        server = listen(address)
     except OSError as error:
-        raise ProcessError(
-            f"process 0 cannot listen at {where}: {os.strerror(error.errno or 0)}"
-        ) from error
+        reason = os.strerror(error.errno or 0)
+        raise ProcessError(f"process 0 cannot listen at {where}: {reason}") from error
     with server:
         server.settimeout(0.1)
         while len(abouts) < count and not refusal:
-            _accept(server, hellos)
+            with contextlib.suppress(OSError):
+                if threading.active_count() < THREADS:
+                    caller = server.accept()[0], hellos
+                    threading.Thread(target=_ask, args=caller, daemon=True).start()
             if time.monotonic() > until:
                 missing = ", ".join(str(k) for k in range(count) if k not in abouts)
                 refusal = f"process {missing} has not come to {where} in {patience_s:g} s"
@@ -86,25 +82,25 @@ def host(
     return connections, everyone
 
 
-def _accept(server: socket.socket, hellos: Any) -> None:
-    """Takes the next connection, if one comes, and lets a thread ask who it is."""
+def listen(address: tuple[str, int]) -> socket.socket:
+    """Listens at an IP and a port, 0 for any."""
+    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    return socket.create_server(address, family=family)
 
-    def ask(connection: socket.socket) -> None:
-        hello = _receive(connection, 5)
-        numbers = hello.get("index"), hello.get("count")
-        if hello.get("program") == PROGRAM and all(isinstance(x, int) for x in numbers):
-            hellos.put((connection, *numbers, hello.get("about")))
-        else:
-            connection.close()
 
-    with contextlib.suppress(OSError):
-        if threading.active_count() < THREADS:
-            threading.Thread(target=ask, args=(server.accept()[0],), daemon=True).start()
+def _ask(connection: socket.socket, hellos: Any) -> None:
+    """Asks who has connected: a process of ours goes into `hellos`, a stranger is dropped."""
+    hello = _receive(connection, HELLO_S)
+    numbers = hello.get("index"), hello.get("count")
+    if hello.get("program") == PROGRAM and all(isinstance(x, int) for x in numbers):
+        hellos.put((connection, *numbers, hello.get("about")))
+    else:
+        connection.close()
 
 
 def visit(
     address: tuple[str, int], index: int, count: int, about: Any, patience_s: float
-) -> tuple[dict[int, socket.socket], list[Any]]:
+) -> Meeting:
     """Comes to process 0, as process `index`, and waits for all others; otherwise as `host`."""
     where, until = f"{address[0]} port {address[1]}", time.monotonic() + patience_s
     while True:  # process 0 may be started later

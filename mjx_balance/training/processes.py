@@ -1,47 +1,105 @@
-"""What the processes of a run, on one machine or many, do together: over `jax.distributed`."""
+"""The processes of a run, on one machine or many, over `jax.distributed`."""
 
 import atexit
 import contextlib
+import dataclasses
 import json
 import os
+import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, TypeVar, cast
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, NoReturn, TypeVar, cast
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from mjx_balance.errors import FAILED, INTERRUPTED
-from mjx_balance.training.cluster import (
-    PATIENCE_S,
-    Cluster,
-    describe_machine,
-    free_address,
-    resolve,
-    share_machine,
-)
-from mjx_balance.training.meeting import ProcessError, Watch, host, visit
+from mjx_balance.errors import FAILED, INTERRUPTED, InputError
+from mjx_balance.files.text import MESSAGE, shorten
+from mjx_balance.machine import core_ids
+from mjx_balance.training.meeting import ProcessError, Watch, host, listen, visit
 
 T = TypeVar("T")
 
+PATIENCE_S = 300
+"""Time in which all processes must come, s: as long as `jax.distributed` gives them."""
 
+
+class Interrupted(Exception):
+    """The user stopped the run; the message says what is saved and how to go on."""
+
+
+class Cluster(NamedTuple):
+    """A process among all of its run, in the words of `jax.distributed.initialize`."""
+
+    coordinator_address: str
+    """HOST:PORT or [IPv6]:PORT at which process 0 listens."""
+    num_processes: int
+    process_id: int
+    local_device_ids: Sequence[int] | None = None
+    """Ids of this process's GPUs; all if None."""
+
+
+def find_cluster(address: str | None, process_id: int | None, count: int | None) -> Cluster:
+    """The place of this process by flags and, for those that are None, by what JAX detects.
+
+    Raises:
+      ProcessError: for an impossible flag, or if Slurm, Open MPI and Kubernetes do not fill it in.
+    """
+    flags = {"--coordinator": address, "--process-id": process_id, "--num-processes": count}
+    missing, devices = [name for name, value in flags.items() if value is None], None
+    if missing:
+        from jax._src.clusters import ClusterEnv  # no public name leads to it
+
+        try:
+            address, count, process_id, devices = ClusterEnv.auto_detect_unset_distributed_params(
+                address, count, process_id, None, None, PATIENCE_S
+            )
+        except Exception as error:  # whatever a cluster's own library raises
+            reason = shorten(error, MESSAGE)
+            raise ProcessError(f"the cluster does not place this process: {reason}") from error
+    if address is None or count is None or process_id is None:
+        raise ProcessError(
+            f"JAX finds no Slurm, Open MPI or Kubernetes here; say {', '.join(missing)} too"
+        )
+    if count < 1:
+        raise ProcessError(f"num_processes is {count}; it must be at least 1")
+    if not 0 <= process_id < count:
+        raise ProcessError(
+            f"process_id is {process_id}; it must be from 0 to num_processes - 1, {count - 1}"
+        )
+    resolve(address)
+    return Cluster(address, count, process_id, devices)
+
+
+def resolve(address: str) -> tuple[str, int]:
+    """IP and port of HOST:PORT or [IPv6]:PORT.
+
+    Raises:
+      ProcessError: if it is neither, or the host is unknown.
+    """
+    name, _, port = address.rpartition(":")
+    if not name or not port.isascii() or not port.isdigit() or not 0 < int(port) < 2**16:
+        raise ProcessError(f"coordinator is {address!r}; it must be HOST:PORT of process 0")
+    try:
+        return str(socket.getaddrinfo(name.strip("[]"), None)[0][4][0]), int(port)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ProcessError(f"coordinator is {address!r}; its host is unknown: {reason}") from error
+
+
+@dataclasses.dataclass(frozen=True)
 class Processes:
     """All processes of a run, as one of them sees them; all of them call the same methods."""
 
-    def __init__(
-        self, index: int = 0, count: int = 1, watch: Watch | None = None, cores: int | None = None
-    ):
-        """Of process `index` of `count`, whose devices JAX has connected.
-
-        Args:
-          index: of this process.
-          count: of all.
-          watch: notices those that die.
-          cores: that every process has; as many as there are if None.
-        """
-        self.index, self.count, self.cores, self._watch = index, count, cores, watch
+    index: int = 0
+    """Of this process."""
+    count: int = 1
+    watch: Watch | None = None
+    """Notices those that die."""
+    cores: int | None = None
+    """CPU cores that every process has; None: all of this one."""
 
     @property
     def first(self) -> bool:
@@ -63,33 +121,27 @@ class Processes:
         return any(self.gather(flag))
 
     def run_on_all(self, function: Callable[[], T], *errors: type[Exception]) -> T:
-        """Returns what a function returns in this process, once it has returned in all of them.
+        """Returns what a function returns here, once it has returned in all processes.
 
-        Args:
-          function: called in every process.
-          errors: what it may raise; all processes raise it then, with the message of the first.
+        If it raises one of `errors` in one of them, all raise it, with the message of the first.
         """
-        value, failure = None, None
+        value, failure, own = None, None, None
         try:
             value = function()
         except errors as error:
-            failure = error
-        kinds = [kind.__name__ for kind in errors if isinstance(failure, kind)]
-        failures = self.gather([kinds[0], str(failure)] if kinds else None)
-        if failure is None and any(failures):
-            k, (name, message) = next((k, x) for k, x in enumerate(failures) if x)
-            kind = next(kind for kind in errors if kind.__name__ == name)
-            failure = kind(f"process {k}: {message}" if k else message)
+            kind = next(k for k, kind in enumerate(errors) if isinstance(error, kind))
+            failure, own = error, (kind, str(error))
+        failures = self.gather(own)
         if failure is not None:
             raise failure
+        for k, (kind, message) in ((k, x) for k, x in enumerate(failures) if x):
+            raise errors[kind](f"process {k}: {message}" if k else message)
         return cast(T, value)
 
     def broadcast(self, function: Callable[[], T], *errors: type[Exception]) -> T:
-        """Returns in all processes the JSON value that a function returns in the first.
+        """Returns in all processes the JSON value that a function returns in the first alone.
 
-        Args:
-          function: called in the first process alone.
-          errors: what it may raise; all processes raise it then.
+        If it raises one of `errors`, all processes raise it.
         """
         value = self.run_on_all(lambda: function() if self.first else None, *errors)
         return cast(T, self.gather(value)[0])
@@ -110,14 +162,14 @@ class Processes:
                     )
 
     def advise(self, advice: str) -> None:
-        """Sets what the user reads besides if another process is gone."""
-        if self._watch is not None:
-            self._watch.advice = advice
+        """Sets the end of the sentence that the user reads if another process is gone."""
+        if self.watch is not None:
+            self.watch.advice = advice
 
     def leave(self) -> None:
-        """Disconnects the devices, all processes at once; a process that ends before is missed."""
-        if self._watch is not None:
-            self._watch.end()
+        """Disconnects the devices; a process that exits without it is reported lost."""
+        if self.watch is not None:
+            self.watch.end()
             with contextlib.suppress(jax.errors.JaxRuntimeError):
                 jax.distributed.shutdown()
 
@@ -127,12 +179,10 @@ ALONE = Processes()
 
 
 @contextlib.contextmanager
-def joined(cluster: Cluster | None, orderly: tuple[type[Exception], ...]) -> Iterator[Processes]:
+def joined(cluster: Cluster | None) -> Iterator[Processes]:
     """This process among all others of the run; alone without a cluster. Before JAX is used.
 
-    Args:
-      cluster: from `find_cluster`.
-      orderly: errors that all processes raise together: nobody is missed then.
+    All processes raise an `InputError` or `Interrupted` together: nobody is missed then.
 
     Raises:
       ProcessError: if not all come in time, or they do not fit together.
@@ -143,18 +193,20 @@ def joined(cluster: Cluster | None, orderly: tuple[type[Exception], ...]) -> Ite
     processes = _connect(cluster)
     try:
         yield processes
-    except (ProcessError, *orderly):
+    except (InputError, Interrupted):
         processes.leave()
         raise
     except BaseException as error:
-        time.sleep(2)  # if that is because of a process that is gone, it is said meanwhile
+        time.sleep(2)  # if a process is gone, `Watch` says so meanwhile
         # At its exit JAX would wait for the others, who may wait for this process.
-        atexit.register(_exit, INTERRUPTED if isinstance(error, KeyboardInterrupt) else FAILED)
+        interrupted = isinstance(error, KeyboardInterrupt)
+        atexit.register(exit_at_once, INTERRUPTED if interrupted else FAILED)
         raise
     processes.leave()
 
 
-def _exit(code: int) -> None:
+def exit_at_once(code: int) -> NoReturn:
+    """Ends the process without waiting for its threads."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
@@ -163,24 +215,56 @@ def _exit(code: int) -> None:
 def _connect(cluster: Cluster) -> Processes:
     """Meets the others, shares the machine with them and connects the devices of all."""
     index, count = cluster.process_id, cluster.num_processes
-    ip, port = resolve(cluster.coordinator_address)
+    address = resolve(cluster.coordinator_address)
+    about: dict[str, Any] = {"machine": socket.gethostname(), "cores": core_ids()}
     if index:
-        connections, everyone = visit((ip, port), index, count, describe_machine(), PATIENCE_S)
+        connections, everyone = visit(address, index, count, about, PATIENCE_S)
     else:
-        about = describe_machine() | {"service": free_address(ip)}
-        connections, everyone = host((ip, port), count, about, PATIENCE_S)
+        about["service"] = _free_address(address[0])
+        connections, everyone = host(address, count, about, PATIENCE_S)
     watch = Watch(connections)
     num_cores = share_machine(everyone, index)
-    os.environ["no_grpc_proxy"] = ip  # noqa: SIM112
+    os.environ["no_grpc_proxy"] = address[0]  # noqa: SIM112
     jax.config.update("jax_check_proxy_envs", False)
+    service = everyone[0]["service"]
     jax.distributed.initialize(
-        everyone[0]["service"],
+        service,
         count,
         index,
         local_device_ids=cluster.local_device_ids,
         cluster_detection_method="deactivate",
-        coordinator_bind_address=everyone[0]["service"],
-        initialization_timeout=300,
-        shutdown_timeout_seconds=300,
+        coordinator_bind_address=service,
     )
     return Processes(index, count, watch, num_cores)
+
+
+def _free_address(ip: str) -> str:
+    """IP:PORT of this machine, at which nobody listens."""
+    with listen((ip, 0)) as server:
+        return f"{f'[{ip}]' if ':' in ip else ip}:{server.getsockname()[1]}"
+
+
+def share_machine(everyone: Sequence[Mapping[str, Any]], index: int) -> int:
+    """Binds processes that may use the same cores of one machine to cores of their own each.
+
+    Args:
+      everyone: `machine` and `cores` of every process.
+      index: of this process.
+
+    Returns:
+      Least number of cores of a process.
+    """
+    places = [(own["machine"], own["cores"]) for own in everyone]
+    shares = []
+    for k, (_, cores) in enumerate(places):
+        beside, before = places.count(places[k]), places[:k].count(places[k])
+        shares.append(cores[before::beside] if beside <= len(cores) else cores)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, shares[index])
+    # A message wakes gloo's thread, which spins if another thread has its connection; on one core
+    # that thread then waits for its next time slice: 4 ms for an exchange of 27 kB instead of 0.1.
+    # A thread of a batch job that wakes up interrupts nobody.
+    if hasattr(os, "SCHED_BATCH"):
+        with contextlib.suppress(OSError):  # not everybody may
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    return min(len(share) for share in shares)

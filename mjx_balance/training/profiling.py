@@ -1,19 +1,20 @@
 """Where a call of the training program spends its time, by the names of its parts.
 
-XLA's traces of a CPU name an operation without the scope that it comes from (jaxlib 0.9.2): their
-stats are `hlo_op`, `hlo_module` and numbers. The compiled program's text has both, for every
-platform.
+XLA's traces of a CPU name operations without their scopes (jaxlib 0.9.2); the compiled program's
+text has both, on every platform.
 """
 
+import dataclasses
 import re
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 
 from mjx_balance.files.run_folder import write_json
-from mjx_balance.training.program_cache import CompiledProgram, LogFn
+from mjx_balance.training.program_cache import CompiledProgram
 
 MEANING = {
     "physics": "the engine's steps",
@@ -29,9 +30,8 @@ SCOPES = ("physics", "env", "acting", "replay", "updates")
 """`jax.named_scope`s of env and learner; the innermost of them counts."""
 EXCHANGES = ("psum", "pmin", "pmax", "all_gather")
 """What devices wait for each other in."""
-OTHER, EXCHANGE, HOST = "other", "exchange", "host"
 SKIPPED = 3
-"""Calls before the one that is looked at: until then there are no updates yet."""
+"""Calls before the one that is traced: until then there are no updates yet."""
 TOO_SHORT = (
     f"--profile traces call {SKIPPED + 1} of the training program, and the run ended before it; "
     "raise num_env_steps, or lower log_every"
@@ -46,87 +46,69 @@ class Event(NamedTuple):
     duration: float
     """ns"""
 
+    @property
+    def end(self) -> float:
+        return self.start + self.duration
 
+
+@dataclasses.dataclass
 class Profiled:
     """A program, one of whose calls is traced."""
 
-    def __init__(
-        self,
-        program: CompiledProgram,
-        folder: Path,
-        log_fn: LogFn,
-    ):
-        """Calls `program`.
-
-        Args:
-          program: compiled without a cache, which would not keep the names of its parts.
-          folder: to write the trace and its `shares.json` into.
-          log_fn: takes the shares of the time.
-        """
-        self._program, self._folder, self._log_fn = program, folder, log_fn
-        self._calls = 0
+    program: CompiledProgram
+    """Compiled without a cache, which would not keep the names of its parts."""
+    folder: Path
+    """For the trace and its `shares.json`."""
+    log_fn: Callable[[str], None]
+    calls: int = 0
 
     @property
     def begun(self) -> bool:
         """Whether a call has been traced."""
-        return self._calls > SKIPPED
+        return self.calls > SKIPPED
 
     def __call__(self, state: Any) -> tuple[Any, Any]:
-        self._calls += 1
-        if self._calls != SKIPPED + 1:
-            return self._program(state)
-        with jax.profiler.trace(str(self._folder)):
-            results = jax.block_until_ready(self._program(state))
-        self._log(shares(self._folder, scopes(self._program.as_text())))
+        self.calls += 1
+        if self.calls != SKIPPED + 1:
+            return self.program(state)
+        with jax.profiler.trace(str(self.folder)):
+            results = jax.block_until_ready(self.program(state))
+        spent = shares(self.folder, scopes(self.program.compiled.as_text() or ""))
+        write_json(self.folder / "shares.json", spent)
+        self.log_fn(f"a call of the training program, traced in {self.folder}:")
+        for name, share in spent.items():
+            self.log_fn(f"  {name:<9}{share:6.1%}  {MEANING[name]}")
         return results
-
-    def _log(self, shares: dict[str, float]) -> None:
-        write_json(self._folder / "shares.json", shares)
-        self._log_fn(f"a call of the training program, traced in {self._folder}:")
-        for name, share in shares.items():
-            self._log_fn(f"  {name:<9}{share:6.1%}  {MEANING[name]}")
 
 
 def scopes(program: str) -> dict[str, str]:
-    """What the operations of a compiled program belong to.
-
-    Args:
-      program: as XLA writes it.
-
-    Returns:
-      Name of an operation -> one of `SCOPES`, "exchange" or "other".
-    """
-    found = {}
+    """Operation of a compiled program, as XLA writes it -> "exchange", "other" or its scope."""
+    belongs = {}
     for name, path in re.findall(r'%?([\w.\-]+) = .*metadata=\{.*?op_name="([^"]*)"', program):
         parts = re.findall(r"\w+", path)
-        inner = [part for part in parts if part in SCOPES]
-        found[name] = inner[-1] if inner else OTHER
+        belongs[name] = next((part for part in reversed(parts) if part in SCOPES), "other")
         if parts and parts[-1] in EXCHANGES:
-            found[name] = EXCHANGE
-    return found
+            belongs[name] = "exchange"
+    return belongs
 
 
-def shares(folder: Path, belongs: dict[str, str]) -> dict[str, float]:
-    """The shares of a traced call's time, which add up to 1; of its first device.
+def shares(folder: Path, belongs: Mapping[str, str]) -> dict[str, float]:
+    """Shares of a traced call's time on its first device, the largest first; their sum is 1.
 
     Args:
       folder: with the trace.
       belongs: from `scopes`.
-
-    Returns:
-      Share by name, the largest first; "host" is the time in which the device does nothing.
     """
-    spent: dict[str, float] = {}
-    first, last, busy = float("inf"), 0.0, 0.0
-    for events in _timelines(folder):
-        for event, own in _own_times(events):
-            name = belongs.get(event.op, OTHER)
-            spent[name] = spent.get(name, 0.0) + own
-            busy += own
-            first, last = min(first, event.start), max(last, event.start + event.duration)
-    if not spent:
+    timelines = list(_timelines(folder))
+    events = [event for timeline in timelines for event in timeline]
+    if not events:
         return {}
-    spent[HOST] = max(0.0, last - first - busy)
+    spent: defaultdict[str, float] = defaultdict(float)
+    for timeline in timelines:
+        for event, time in _own_times(timeline):
+            spent[belongs.get(event.op, "other")] += time
+    span = max(event.end for event in events) - min(event.start for event in events)
+    spent["host"] = max(0.0, span - sum(spent.values()))
     total = sum(spent.values())
     return {name: spent[name] / total for name in sorted(spent, key=lambda name: -spent[name])}
 
@@ -138,25 +120,21 @@ def _timelines(folder: Path) -> Iterator[list[Event]]:
         if plane.name.startswith("/device:") and not plane.name.endswith(":0"):
             continue
         for line in plane.lines:
-            found = []
+            events = []
             for event in line.events:
                 stats = dict(event.stats)
                 if "hlo_op" in stats and str(stats.get("device_ordinal", 0)) == "0":
-                    found.append(Event(str(stats["hlo_op"]), event.start_ns, event.duration_ns))
-            if found:
-                yield found
+                    events.append(Event(str(stats["hlo_op"]), event.start_ns, event.duration_ns))
+            yield events
 
 
 def _own_times(events: list[Event]) -> Iterator[tuple[Event, float]]:
-    """Each event of a thread with its time, without what others within it take."""
-    open_ones: list[tuple[Event, list[float]]] = []
+    """The duration of each event, and again, negative, for the event that it runs within."""
+    within: list[Event] = []
     for event in sorted(events, key=lambda event: (event.start, -event.duration)):
-        while open_ones and event.start >= open_ones[-1][0].start + open_ones[-1][0].duration:
-            done, inner = open_ones.pop()
-            yield done, done.duration - sum(inner)
-        if open_ones:
-            open_ones[-1][1].append(event.duration)
-        open_ones.append((event, []))
-    while open_ones:
-        done, inner = open_ones.pop()
-        yield done, done.duration - sum(inner)
+        while within and event.start >= within[-1].end:
+            within.pop()
+        yield event, event.duration
+        if within:
+            yield within[-1], -event.duration
+        within.append(event)

@@ -5,7 +5,7 @@ import functools
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -13,7 +13,6 @@ from mjx_balance.config import (
     Config,
     ConfigError,
     check_same_config,
-    expand_runs,
     flatten,
     read_run_config,
     to_dict,
@@ -30,35 +29,10 @@ from mjx_balance.files.run_folder import (
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report.progress import Display
 from mjx_balance.sim.engines.table import ENGINES
-from mjx_balance.training import (
-    checkpoints,
-    finish,
-    loop,
-    profiling,
-    program_cache,
-    sizing,
-    validation,
-)
-from mjx_balance.training.checkpoints import CheckpointError
-from mjx_balance.training.cluster import Cluster
-from mjx_balance.training.processes import ALONE, Processes, joined
-from mjx_balance.training.program_cache import LogFn
-
-
-class Interrupted(Exception):
-    """The user stopped the run; the message says what is saved and how to go on."""
-
-
-ORDERLY = (ConfigError, RunFolderError, CheckpointError, PolicyError, Interrupted)
-"""How all processes of a run end together, besides its end."""
-
-
-class Setup(NamedTuple):
-    """What a run is made of; it fits the devices and their memory."""
-
-    config: Config
-    env: BalanceEnv
-    learner: DQN
+from mjx_balance.training import checkpoints, finish, profiling, program_cache, sizing
+from mjx_balance.training.loop import Interrupts, Program, Run, learn, number
+from mjx_balance.training.processes import Cluster, Interrupted, joined
+from mjx_balance.training.validation import validate
 
 
 def train(
@@ -72,7 +46,7 @@ def train(
     """Runs or continues a training and everything that follows it.
 
     Args:
-      config: what to train; when resuming, what the folder's own config must equal.
+      config: to train; must equal that of the folder to continue.
       run_dir: folder to create; one named after preset, seed and time if None.
       resume: folder to continue instead.
       display: shows progress.
@@ -80,8 +54,7 @@ def train(
       profile: whether to trace a call of the training program and sum it up.
 
     Returns:
-      The evaluation, suite name -> JSON of `rollout.summarize`; None where another process
-      makes it.
+      The evaluation, suite name -> JSON of `rollout.summarize`; None in the other processes.
 
     Raises:
       ConfigError: for an impossible config, or an evaluation that would not fit into the memory.
@@ -92,21 +65,26 @@ def train(
       Interrupted: if the user stopped the run.
     """
     start_time = time.perf_counter()
-    with joined(cluster, ORDERLY) as processes:
+    with joined(cluster) as processes:
         sizing.configure_jax(display.say, processes.cores)
-        setup = processes.run_on_all(lambda: _set_up(config), ConfigError)
-        for line in sizing.describe_growth(config, setup.config):
-            display.say(line)
-        folder = _open_folder(setup, run_dir, resume, display.say, processes)
-        with _locked(folder, processes):
-            policies = _learn(setup, folder, display, processes, profile)
+        sized, env, learner = processes.run_on_all(lambda: _set_up(config), ConfigError)
+        if growth := sizing.describe_growth(config, sized):
+            display.say(growth)
+        today = provenance(env)
+        flags = flatten(to_dict(sized)) | {"run_dir": str(run_dir), "resume": str(resume)}
+        processes.check_same(flags | today)
+        path = processes.broadcast(
+            lambda: str(_open_folder(sized, today, run_dir, resume, display)), RunFolderError
+        )
+        run = Run(sized, env, learner, RunFolder(Path(path)), display, processes)
+        _announce(run)
+        with _locked(run):
+            policies = _learn(run, profile)
             processes.leave()  # what follows takes minutes of one process, and no device
-            if not processes.first:
-                return None
-            return finish.finish(setup.config, policies, folder, display, start_time)
+            return finish.finish(run, policies, start_time) if processes.first else None
 
 
-def _set_up(config: Config) -> Setup:
+def _set_up(config: Config) -> tuple[Config, BalanceEnv, DQN]:
     """Sizes a run to the devices; envs that nobody asked for are halved until they fit."""
     most = None
     while True:
@@ -116,7 +94,7 @@ def _set_up(config: Config) -> Setup:
         learner = sizing.make_learner(sized, env)
         try:
             sizing.check_memory(learner)
-            return Setup(sized, env, learner)
+            return sized, env, learner
         except ConfigError:
             if config.num_envs is not None or learner.spec.num_envs <= sizing.CPU_ENVS:
                 raise
@@ -133,135 +111,93 @@ def provenance(env: BalanceEnv) -> dict[str, Any]:
 
 
 def _open_folder(
-    setup: Setup,
+    config: Config,
+    today: dict[str, Any],
     run_dir: Path | None,
     resume: Path | None,
-    log_fn: LogFn,
-    processes: Processes,
-) -> RunFolder:
-    """The folder of a new run, or of the run to continue; logs what will run where.
-
-    Raises:
-      RunFolderError: if it cannot be used, or another process cannot see it.
-      ProcessError: if other processes were started with something else.
-    """
-    config, today = setup.config, provenance(setup.env)
-    flags = flatten(to_dict(config)) | {"run_dir": str(run_dir), "resume": str(resume)}
-    processes.check_same(flags | today)
-
-    def create() -> str:
-        name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-        folder = create_run_folder(run_dir or Path("runs") / name, to_dict(config), today)
-        return str(folder.path.absolute())
-
-    def reopen() -> str:
-        assert resume is not None
+    display: Display,
+) -> Path:
+    """Creates the folder of a new run, or checks that of the run to continue."""
+    if resume is not None:
         check_same_config(read_run_config(resume), config, resume)
         if warning := check_same_provenance(resume, today):
-            log_fn(warning)
-        return str(resume)
+            display.say(warning)
+        return resume
+    name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    folder = create_run_folder(run_dir or Path("runs") / name, to_dict(config), today)
+    return folder.path.absolute()
 
-    path = processes.broadcast(create if resume is None else reopen, RunFolderError)
-    folder = RunFolder(Path(path))
-    processes.advise(f"; continue with --resume {folder.path}")
-    visible = processes.gather(folder.config.is_file())
+
+def _announce(run: Run) -> None:
+    """Logs what runs where; raises `RunFolderError` if a process cannot see the folder."""
+    config, path = run.config, run.folder.path
+    run.processes.advise(f"; continue with --resume {path}")
+    visible = run.processes.gather(run.folder.config.is_file())
     if not all(visible):
         raise RunFolderError(
-            f"process {visible.index(False)} does not see {folder.path}; choose a folder that all "
+            f"process {visible.index(False)} does not see {path}; choose a folder that all "
             "machines share with --run-dir"
         )
-    last = config.seed + len(expand_runs(config)) - 1
+    last = config.seed + run.num_seeds - 1
     seeds = f"seed {last}" if last == config.seed else f"seeds {config.seed} to {last}"
-    log_fn(
-        f"{folder.path}: preset {config.preset}, {seeds}, {config.num_envs} envs on "
+    run.display.say(
+        f"{path}: preset {config.preset}, {seeds}, {config.num_envs} envs on "
         f"{config.num_devices} {jax.devices()[0].device_kind} device(s)"
     )
-    return folder
 
 
 @contextlib.contextmanager
-def _locked(folder: RunFolder, processes: Processes) -> Iterator[None]:
+def _locked(run: Run) -> Iterator[None]:
     """The lock of a run's folder, held by the first process; an interrupt becomes a sentence."""
     with contextlib.ExitStack() as stack:
-        processes.broadcast(lambda: stack.enter_context(locked(folder)), RunFolderError)
+        run.processes.broadcast(lambda: stack.enter_context(locked(run.folder)), RunFolderError)
         try:
             yield
         except KeyboardInterrupt as error:  # the folder is whole anyway
             raise Interrupted(
-                f"stopped at once; continue from the last checkpoint with --resume {folder.path}"
+                "stopped at once; continue from the last checkpoint with --resume "
+                f"{run.folder.path}"
             ) from error
 
 
-def _learn(
-    setup: Setup, folder: RunFolder, display: Display, processes: Processes, profile: bool
-) -> list[Policy]:
-    """Learns to the last decision and exports; the first process alone gets the policies.
-
-    Raises:
-      PolicyError: if no seed has a policy.
-      Interrupted: if the user stopped the run; the policies so far are exported.
-    """
-    plan = loop.make_plan(setup.config, BalanceEnv.metrics)
-    validate = functools.partial(
-        validation.validate, setup.config, setup.learner, setup.env.scene, folder
-    )
-    with loop.Interrupts(display.say) as stop:
-        state, program = prepare(setup, plan, folder, display, stop, processes, profile)
-        state, seconds = loop.learn(
-            plan, program, state, folder, display, stop, validate, processes
-        )
+def _learn(run: Run, profile: bool) -> list[Policy]:
+    """Learns to the last decision and exports; the first process alone gets the policies."""
+    processes, folder = run.processes, run.folder
+    with Interrupts(run.display.say) as stop:
+        state, program = prepare(run, stop, profile)
+        state, seconds = learn(run, program, state, stop, functools.partial(validate, run))
         if isinstance(program, profiling.Profiled) and not program.begun:
-            display.say(profiling.TOO_SHORT)
-
-        def export() -> list[Policy]:
-            known = (setup.config, setup.learner, setup.env.scene.hash, folder)
-            return finish.export(*known, state, seconds, display.say) if processes.first else []
-
-        policies = processes.run_on_all(export, PolicyError)
+            run.display.say(profiling.TOO_SHORT)
+        policies = processes.run_on_all(
+            lambda: finish.export(run, state, seconds) if processes.first else [], PolicyError
+        )
         if processes.any(bool(stop)):
             raise Interrupted(
-                f"stopped at {loop.number(state.env_steps):,} decisions; the policy so far is "
+                f"stopped at {number(state.env_steps):,} decisions; the policy so far is "
                 f"{folder.policy}; continue with --resume {folder.path}"
             )
     return policies
 
 
-def prepare(
-    setup: Setup,
-    plan: loop.Plan,
-    folder: RunFolder,
-    display: Display,
-    stop: loop.Interrupts,
-    processes: Processes = ALONE,
-    profile: bool = False,
-) -> tuple[TrainState, loop.Program]:
-    """The state of the newest checkpoint, or a new run's, and the compiled program.
-
-    Args:
-      setup: of the run.
-      plan: of the run.
-      folder: of the run.
-      display: shows what is done.
-      stop: answers interrupts meanwhile.
-      processes: that compile the same program.
-      profile: whether to trace a call of it.
-    """
-    program: Any = setup.learner.train_program(plan.iterations)
-    compiling = display.phase("compiling (up to a minute the first time, seconds from then on)")
-    with compiling, program_cache.mending_xla_cache(display.say):
-        state = stop.run(setup.learner.init, setup.config.seed)
-        saved = checkpoints.restore(folder.checkpoints, state, display.say, processes)
+def prepare(run: Run, stop: Interrupts, profile: bool = False) -> tuple[TrainState, Program]:
+    """The state of the newest checkpoint or of a new run, and the compiled program."""
+    program: Any = run.learner.train_program(run.iterations)
+    say, processes = run.display.say, run.processes
+    compiling = run.display.phase("compiling (up to a minute the first time, seconds from then on)")
+    with compiling, program_cache.mending_xla_cache(say):
+        state = stop.run(run.learner.init, run.config.seed)
+        saved = checkpoints.restore(run.folder.checkpoints, state, say, processes)
         if saved is not None:
             state = saved
-            display.say(f"resuming at {loop.number(state.env_steps):,} decisions")
-        if loop.number(state.env_steps) < plan.total:
+            say(f"resuming at {number(state.env_steps):,} decisions")
+        if number(state.env_steps) < run.total:
             key = None
             if profile:  # caches keep no names to profile by
                 jax.config.update("jax_enable_compilation_cache", False)
-            elif ENGINES[setup.config.engine].cacheable:
-                key = program_cache.program_key(setup.config, plan.iterations, sizing.__name__)
-            program = stop.run(program_cache.compile_program, program, state, key, display.say)
+            elif ENGINES[run.config.engine].cacheable:
+                key = program_cache.program_key(run.config, run.iterations, sizing.__name__)
+            program = stop.run(program_cache.compile_program, program, state, key, say)
     processes.gather(None)  # whoever compiles longest is awaited here, where nothing times out
     if profile and processes.first:
-        program = profiling.Profiled(program, folder.profile, display.say)
+        program = profiling.Profiled(program, run.folder.profile, say)
     return state, program

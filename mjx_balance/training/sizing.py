@@ -4,23 +4,14 @@ import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import psutil
 from jax.sharding import PartitionSpec
 
-from mjx_balance.config import (
-    Config,
-    ConfigError,
-    check,
-    expand_runs,
-    flatten,
-    preset,
-    sweep_grid,
-    to_dict,
-)
+from mjx_balance.config import Config, ConfigError, check, expand_runs, preset, sweep_grid
 from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 from mjx_balance.dqn.mesh import REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
@@ -53,11 +44,7 @@ updates, each with more transitions: the replay ratio stays."""
 
 
 def configure_jax(log_fn: LogFn, num_cores: int | None = None) -> None:
-    """Makes CPU cores JAX devices and turns the compilation cache on.
-
-    Args:
-      log_fn: takes what is wrong with the cache.
-      num_cores: of each process; all that this one may use if None.
+    """Makes CPU cores (None: all of this process) JAX devices; turns the compilation cache on.
 
     Raises:
       ConfigError: if not all processes have the same number of devices.
@@ -75,31 +62,22 @@ def configure_jax(log_fn: LogFn, num_cores: int | None = None) -> None:
 
 
 def size_to_device(config: Config, most: int | None = None) -> Config:
-    """Fills in what the config leaves to the device; what it says stays.
-
-    Args:
-      config: of a run.
-      most: envs to choose, for want of memory.
+    """Fills in `num_envs`, at most `most`, and `num_devices` if they are None.
 
     Raises:
       ConfigError: if the config is invalid, its engine does not run here, or the envs cannot be
         spread over the devices.
     """
-    device = jax.devices()[0]
-    check_platform(check(config).engine, device.platform, device.device_kind)
-    if config.num_envs is None:
-        config = scale_sizes(config, _default_envs(config.engine, most))
-    assert config.num_envs is not None
-    num_devices = _share_out(config.num_devices, config.num_envs, config.dqn.batch_size)
-    return check(dataclasses.replace(config, num_devices=num_devices))
-
-
-def _default_envs(engine: str, most: int | None) -> int:
-    if jax.devices()[0].platform == "cpu":
+    device, num_envs = jax.devices()[0], check(config).num_envs
+    check_platform(config.engine, device.platform, device.device_kind)
+    if num_envs is None:
         num_envs = CPU_ENVS
-    else:
-        num_envs = measured_envs(engine) or ACCELERATOR_ENVS
-    return min(num_envs, most or num_envs)
+        if device.platform != "cpu":
+            num_envs = _measured_sizes().get(_device(config.engine), ACCELERATOR_ENVS)
+        num_envs = min(num_envs, most or num_envs)
+        config = scale_sizes(config, num_envs)
+    num_devices = _share_out(config.num_devices, num_envs, config.dqn.batch_size)
+    return check(dataclasses.replace(config, num_devices=num_devices))
 
 
 def _share_out(num_devices: int | None, num_envs: int, batch_size: int) -> int:
@@ -111,12 +89,11 @@ def _share_out(num_devices: int | None, num_envs: int, batch_size: int) -> int:
         num_devices = next(even, processes)
     if num_devices > available:
         raise ConfigError(f"num_devices is {num_devices}; this machine has {available} JAX devices")
-    multiples = (
+    for name, value, divisor, size in (
         ("num_devices", num_devices, "num_processes", processes),
         ("num_envs", num_envs, "num_devices", num_devices),
         ("batch_size", batch_size, "num_devices", num_devices),
-    )
-    for name, value, divisor, size in multiples:
+    ):
         if value % size:
             raise ConfigError(f"{name} is {value}; it must be a multiple of {divisor}, {size}")
     return num_devices
@@ -126,100 +103,85 @@ def scale_sizes(config: Config, num_envs: int) -> Config:
     """The config with so many envs; every size that is still its preset's grows with them."""
     defaults, scale = preset(config.preset), num_envs / CPU_ENVS
 
-    def scaled(own: Any, default: Any, names: Sequence[str]) -> dict[str, int]:
+    def scaled(own: Any, default: Any, names: tuple[str, ...]) -> Any:
         values = {name: getattr(own, name) for name in names}
-        return {k: round(scale * x) for k, x in values.items() if x == getattr(default, k)}
+        grown = {k: round(scale * x) for k, x in values.items() if x == getattr(default, k)}
+        return dataclasses.replace(own, **grown)
 
     dqn = scaled(config.dqn, defaults.dqn, LEARNER_COUNTED_IN_ENVS)
-    return dataclasses.replace(
-        config,
-        num_envs=num_envs,
-        dqn=dataclasses.replace(config.dqn, **dqn),
-        **scaled(config, defaults, COUNTED_IN_ENVS),
-    )
+    config = scaled(config, defaults, COUNTED_IN_ENVS)
+    return dataclasses.replace(config, num_envs=num_envs, dqn=dqn)
 
 
-def describe_growth(config: Config, sized: Config) -> list[str]:
-    """The line for the user about sizes that follow from the device, if there are any."""
-    before, after = flatten(to_dict(config)), flatten(to_dict(sized))
-    names = (*COUNTED_IN_ENVS, *LEARNER_COUNTED_IN_ENVS)
-    changed = [f"{name} {after[name]:,}" for name in names if after[name] != before[name]]
+def describe_growth(config: Config, sized: Config) -> str:
+    """The line for the user about sizes that follow from the device; empty if there are none."""
+    pairs = (config, sized, COUNTED_IN_ENVS), (config.dqn, sized.dqn, LEARNER_COUNTED_IN_ENVS)
+    changed = [
+        f"{name} {getattr(after, name):,}"
+        for before, after, names in pairs
+        for name in names
+        if getattr(after, name) != getattr(before, name)
+    ]
     if not changed:
-        return []
-    return [f"with num_envs {sized.num_envs:,} come {', '.join(changed)}; what you say stays"]
-
-
-def measured_envs(engine: str) -> int | None:
-    """The number of envs that was found best for this device; none if nobody measured it."""
-    found = _measured_sizes().get(_device(engine))
-    return found if isinstance(found, int) and found > 0 else None
+        return ""
+    return f"with num_envs {sized.num_envs:,} come {', '.join(changed)}; what you say stays"
 
 
 def remember_envs(engine: str, rates: Mapping[int, float]) -> int:
-    """Keeps the number of envs to size runs on this device by: the fewest that come near the best.
+    """Saves the number of envs for runs on this device: the fewest that come near the best rate.
 
     Args:
-      engine: that was measured.
+      engine: of the measurement.
       rates: number of envs -> physics steps per second.
     """
     enough = NEAR_BEST * max(rates.values())
     chosen = min(num_envs for num_envs, rate in rates.items() if rate >= enough)
-    known = _measured_sizes()
+    sizes = _measured_sizes() | {_device(engine): chosen}
     cache_dir().mkdir(parents=True, exist_ok=True)
-    write_json(cache_dir() / SIZES_FILE, known | {_device(engine): chosen})
+    write_json(cache_dir() / SIZES_FILE, sizes)
     return chosen
 
 
-def _measured_sizes() -> dict[str, Any]:
-    """By device and engine; nothing if the file is missing or damaged."""
+def _measured_sizes() -> dict[str, int]:
+    """Numbers of envs by device and engine; what is missing or damaged is left out."""
     try:
-        known = json.loads((cache_dir() / SIZES_FILE).read_text())
-    except (OSError, ValueError):
+        sizes = json.loads((cache_dir() / SIZES_FILE).read_text())
+        return {k: v for k, v in sizes.items() if isinstance(v, int) and v > 0}
+    except (OSError, ValueError, AttributeError):
         return {}
-    return known if isinstance(known, dict) else {}
 
 
 def _device(engine: str) -> str:
     return f"{jax.devices()[0].device_kind}, engine {engine}"
 
 
-def used_devices(num_devices: int) -> list[Any]:
-    """The devices of a run's mesh, the same number of every process, in their order."""
-    each, processes = num_devices // jax.process_count(), range(jax.process_count())
-    return [x for k in processes for x in jax.local_devices(process_index=k)[:each]]
-
-
 def make_learner(config: Config, env: BalanceEnv) -> DQN:
     """The DQN for a config that `size_to_device` has completed."""
     assert config.num_envs is not None
     assert config.num_devices is not None
-    runs = expand_runs(config)
-    radial = config.dqn.head == "radial"
-    network = QNetwork(config.dqn.hidden_sizes, network_factors(config), radial)
+    runs, processes = expand_runs(config), jax.process_count()
+    each = config.num_devices // processes
     spec = DQNSpec(
         config=config.dqn,
         num_envs=config.num_envs,
         num_env_steps=config.num_env_steps,
-        devices=used_devices(config.num_devices),
+        devices=[x for k in range(processes) for x in jax.local_devices(process_index=k)[:each]],
         num_seeds=len(runs),
         symmetries=env.symmetries,
         action_factors=env.action_factors,
         first_reset=env.reset_staggered,
         sweep={name: [getattr(run.dqn, name) for run in runs] for name in sweep_grid(config)[0]},
     )
-    return DQN(env, network, spec)
+    radial = config.dqn.head == "radial"
+    return DQN(env, QNetwork(config.dqn.hidden_sizes, network_factors(config), radial), spec)
 
 
 def check_memory(learner: DQN) -> None:
-    """Refuses a run that would not fit into a device or into this machine, before it allocates.
-
-    Raises:
-      ConfigError: with the estimate.
-    """
+    """Raises `ConfigError` if a run would not fit into a device or into this machine."""
     spec, needed = learner.spec, device_bytes(learner)
-    device = learner.mesh.devices.ravel()[0]
+    device = spec.devices[0]
     if device.platform == "cpu":
-        mine = [x for x in learner.mesh.devices.ravel() if x.process_index == jax.process_index()]
+        mine = [x for x in spec.devices if x.process_index == jax.process_index()]
         where, needed = "this machine", len(mine) * needed
         available = psutil.virtual_memory().available
     else:
@@ -236,7 +198,7 @@ def check_memory(learner: DQN) -> None:
 
 
 def device_bytes(learner: DQN) -> float:
-    """Memory that a run takes on each of its devices, besides its program."""
+    """Memory that a run takes on each of its devices, besides its program, bytes."""
     shapes = jax.eval_shape(lambda: learner.init(0))
 
     def own(spec: PartitionSpec, part: Any) -> float:
@@ -249,10 +211,10 @@ def device_bytes(learner: DQN) -> float:
 
 
 def explained(error: Exception) -> str | None:
-    """What the user can do about an error of a running program, in a sentence; none if unknown."""
-    said = str(error)
-    if "RESOURCE_EXHAUSTED" in said:
+    """What the user can do about an error of a running program, in a sentence; None if unknown."""
+    text = str(error)
+    if "RESOURCE_EXHAUSTED" in text:
         return "the device has no memory left; lower num_envs, num_seeds or replay_capacity"
-    if "WarpOverflowError: " in said:
-        return said.partition("WarpOverflowError: ")[2].splitlines()[0]
+    if "WarpOverflowError: " in text:
+        return text.partition("WarpOverflowError: ")[2].splitlines()[0]
     return None

@@ -1,15 +1,12 @@
 """The end of a run: a policy per seed that has one, the best of them, and files written whole."""
 
 import dataclasses
-import io
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event
 
 from mjx_balance import load_policy
@@ -18,7 +15,6 @@ from mjx_balance.evaluation.suites import SEEDS
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report import figures, measuring
-from mjx_balance.report.progress import Display
 from mjx_balance.training import finish
 
 CONFIG = preset("smoke")
@@ -26,33 +22,24 @@ SEED = CONFIG.seed
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> RunFolder:
-    return RunFolder(tmp_path)
+def export(make_run: Any, stub_learner: Any) -> Callable[..., list[Policy]]:
+    """Scales of the stub's parameters -> policies."""
 
-
-@pytest.fixture
-def export(folder: RunFolder, stub_learner: Any) -> Callable[..., tuple[list[Policy], list[str]]]:
-    """Scales of the stub's parameters -> policies, and what was said."""
-
-    def export(*scales: float) -> tuple[list[Policy], list[str]]:
-        config, said = dataclasses.replace(CONFIG, num_seeds=len(scales)), []
-        state = stub_learner.state_of(*scales)
-        policies = finish.export(config, stub_learner, "hash", folder, state, 1.26, said.append)
-        return policies, said
+    def export(*scales: float) -> list[Policy]:
+        run = make_run(dataclasses.replace(CONFIG, num_seeds=len(scales)))
+        return finish.export(run, stub_learner.state_of(*scales), 1.26)
 
     return export
 
 
-def first_weight(policy: Policy) -> float:
-    return float(policy.layers[0][0].ravel()[0])
-
-
-def test_one_seed_gives_one_policy(folder: RunFolder, stub_learner: Any, export: Any) -> None:
-    [policy], said = export(2.0)
-    assert said == []
+def test_one_seed_gives_one_policy(
+    folder: RunFolder, display: Any, stub_learner: Any, export: Any
+) -> None:
+    [policy] = export(2.0)
+    assert display.lines == []
     saved = load_policy(folder.policy)
     assert saved.fingerprint == policy.fingerprint
-    assert first_weight(saved) == pytest.approx(2 * stub_learner.first_weight)
+    assert stub_learner.scale_of(saved) == pytest.approx(2)
     assert saved.scene_hash == "hash"
     training = saved.manifest["training"]
     assert (training["env_steps"], training["gradient_steps"]) == (64, 192)
@@ -60,30 +47,24 @@ def test_one_seed_gives_one_policy(folder: RunFolder, stub_learner: Any, export:
     assert not folder.seeds.exists()
 
 
-def test_every_seed_gives_a_policy_of_its_own(
-    folder: RunFolder, stub_learner: Any, export: Any
+def test_every_seed_gives_a_policy_of_its_own_and_a_diverged_one_none(
+    folder: RunFolder, display: Any, stub_learner: Any, export: Any
 ) -> None:
-    policies, _ = export(1.0, 2.0, 3.0)
-    for k, policy in enumerate(policies):
+    policies = export(np.nan, 2.0, np.inf, 4.0)
+    assert [policy.config.seed for policy in policies] == [SEED + 1, SEED + 3]
+    for k, policy in zip((1, 3), policies, strict=True):
         saved = load_policy(folder.seed_policy(SEED + k))
         assert saved.fingerprint == policy.fingerprint
-        assert first_weight(saved) == pytest.approx((k + 1) * stub_learner.first_weight)
+        assert stub_learner.scale_of(saved) == pytest.approx(k + 1)
         assert (saved.config.seed, saved.config.num_seeds) == (SEED + k, 1)
     assert load_policy(folder.policy).fingerprint == policies[0].fingerprint
-
-
-def test_a_diverged_seed_does_not_hold_the_others_up(folder: RunFolder, export: Any) -> None:
-    policies, said = export(np.nan, 2.0, np.inf, 4.0)
-    assert [policy.config.seed for policy in policies] == [SEED + 1, SEED + 3]
-    assert len(said) == 2
-    assert said[0].startswith(f"seed {SEED} gives no policy: weight ")
-    assert said[1].startswith(f"seed {SEED + 2} gives no policy: weight ")
-    assert "not finite numbers" in said[0]
-    assert load_policy(folder.policy).config.seed == SEED + 1
+    for k, line in zip((0, 2), display.lines, strict=True):
+        assert line.startswith(f"seed {SEED + k} gives no policy: weight ")
+        assert "not finite numbers" in line
 
 
 @pytest.mark.parametrize("scales", [(np.nan,), (np.nan, np.nan)])
-def test_no_policy_at_all_is_said(
+def test_no_policy_at_all_is_an_error(
     folder: RunFolder, scales: tuple[float, ...], export: Any
 ) -> None:
     with pytest.raises(PolicyError, match="learnt no policy of finite numbers; lower learning"):
@@ -91,16 +72,21 @@ def test_no_policy_at_all_is_said(
     assert not folder.policy.exists()
 
 
-def test_an_evaluation_beyond_the_memory_is_refused_by_its_field() -> None:
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        ("eval_scenarios", 100_000_000, "eval_scenarios is 100000000 and duration 20 s: that"),
+        ("eval_duration", 1e12, "GiB are free"),
+        ("validation_scenarios", 100_000_000, "validation_scenarios is 100000000 and duration 10"),
+        ("validation_duration", 1e12, "validation_scenarios is 2 and duration 1e"),
+    ],
+)
+def test_an_evaluation_beyond_the_memory_is_refused_by_its_field(
+    field: str, value: float, sentence: str
+) -> None:
     finish.check_fits(CONFIG)
-    with pytest.raises(ConfigError, match="eval_scenarios is 100000000 and duration 20 s: that"):
-        finish.check_fits(dataclasses.replace(CONFIG, eval_scenarios=100_000_000))
-    with pytest.raises(ConfigError, match="GiB are free"):
-        finish.check_fits(dataclasses.replace(CONFIG, eval_duration=1e12))
-    with pytest.raises(ConfigError, match="validation_scenarios is 100000000 and duration 10 s:"):
-        finish.check_fits(dataclasses.replace(CONFIG, validation_scenarios=100_000_000))
-    with pytest.raises(ConfigError, match="validation_scenarios is 2 and duration 1e"):
-        finish.check_fits(dataclasses.replace(CONFIG, validation_duration=1e12))
+    with pytest.raises(ConfigError, match=sentence):
+        finish.check_fits(dataclasses.replace(CONFIG, **{field: value}))
 
 
 def result(suite: str, falls: int, mean: float, seed: int) -> dict[str, Any]:
@@ -139,16 +125,15 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 @pytest.fixture
-def finished(folder: RunFolder, export: Any) -> Callable[..., dict[str, Any]]:
+def finished(make_run: Any, export: Any, calls: list[Any]) -> Callable[..., dict[str, Any]]:
     """Scales of the stub's parameters -> what the end of such a run returns."""
 
     def finished(*scales: float, sweep: tuple[str, ...] = ()) -> dict[str, Any]:
-        policies, _ = export(*scales)
+        policies = export(*scales)
         num_seeds = len(scales) // 2 if sweep else len(scales)
         config = dataclasses.replace(CONFIG, num_seeds=num_seeds, sweep=sweep)
         config = dataclasses.replace(config, eval_scenarios=4, eval_duration=5.0)
-        display = Display(Console(file=io.StringIO(), width=200))
-        return finish.finish(config, policies, folder, display, 0.0)
+        return finish.finish(make_run(config), policies, 0.0)
 
     return finished
 
@@ -157,13 +142,8 @@ def test_one_seed_is_evaluated_on_both_suites(
     folder: RunFolder, calls: list[Any], finished: Any
 ) -> None:
     results = finished(1.0)
-    seed = SEEDS.final
-    assert calls == [
-        (SEED, "paper", 4, 5.0, seed),
-        (SEED, "corner", 4, 5.0, seed),
-        ("figures", SEED),
-        "summary",
-    ]
+    asked = [(SEED, suite, 4, 5.0, SEEDS.final) for suite in ("paper", "corner")]
+    assert calls == [*asked, ("figures", SEED), "summary"]
     assert json.loads(folder.evaluation.read_text()) == results
     assert results["corner"]["tilt_deg"]["mean"] == 0.5
     assert not folder.seeds_summary.exists()
@@ -186,36 +166,30 @@ def test_the_best_seed_is_chosen_by_the_validation_alone(
     assert seeds["statistics"]["corner"]["seeds"] == 4
     assert seeds["statistics"]["corner"]["falls"] == 28
     asked = {call[2:] for call in calls if len(call) == 5}
-    assert asked == {
-        (4, 5.0, SEEDS.final),
-        (finish.CHOICE_SCENARIOS, 5.0, SEEDS.validation),
-    }
+    choice = (finish.CHOICE_SCENARIOS, 5.0, SEEDS.validation)
+    assert asked == {(4, 5.0, SEEDS.final), choice}
     assert SEEDS.final != SEEDS.validation
 
 
-def test_a_diverged_seed_is_never_chosen(
-    folder: RunFolder, calls: list[Any], finished: Any
-) -> None:
+def test_a_diverged_seed_is_never_chosen(folder: RunFolder, finished: Any) -> None:
     finished(1.0, np.nan, 3.0)
     seeds = json.loads(folder.seeds_summary.read_text())
     assert [row["seed"] for row in seeds["seeds"]] == [SEED, SEED + 2]
-    assert seeds["best"] == SEED
-    assert load_policy(folder.policy).config.seed == SEED
+    assert seeds["best"] == load_policy(folder.policy).config.seed == SEED
     folder.evaluation.unlink()
     finished(1.0, np.nan)  # the only one left needs no rival
     assert json.loads(folder.seeds_summary.read_text())["best"] == SEED
 
 
-def test_figures_are_of_the_metrics_and_of_the_scenario_kept_for_them(
+def test_figures_are_of_the_metrics_and_of_a_scenario_of_their_own(
     folder: RunFolder, export: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """100 s of suite paper, drawn by a seed that nothing else uses."""
-    [policy], _ = export(1.0)
+    [policy] = export(1.0)
     folder.metrics.write_text('{"env_steps": 1}\n{"env_steps": 2}\n')
     drawn: list[Any] = []
-    monkeypatch.setattr(
-        measuring, "record_rollout", lambda policy, *given: (policy.fingerprint, *given)
-    )
+    record = lambda policy, *given: (policy.fingerprint, *given)  # noqa: E731
+    monkeypatch.setattr(measuring, "record_rollout", record)
     monkeypatch.setattr(figures, "draw_figures", lambda *given: drawn.append(given))
     monkeypatch.setattr(finish.evaluation, "policy_scene", lambda policy: policy.scene_hash)
     finish._draw(folder)
@@ -225,19 +199,12 @@ def test_figures_are_of_the_metrics_and_of_the_scenario_kept_for_them(
 
 
 def test_a_run_killed_while_it_finishes_finishes_again(
-    folder: RunFolder, calls: list[Any], monkeypatch: pytest.MonkeyPatch, finished: Any
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, finished: Any
 ) -> None:
     """It counts as finished only once all is written, and TensorBoard has it once."""
-
-    class Killed(BaseException):
-        pass
-
-    def die(*given: Any) -> None:
-        raise Killed
-
     with monkeypatch.context() as patch:
-        patch.setattr(finish, "_draw", die)
-        with pytest.raises(Killed):
+        patch.setattr(finish, "_draw", lambda folder: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
             finished(1.0)
     assert not folder.evaluation.exists()
     # TensorBoard's names count seconds: two runs within one would hide a file that is left.
@@ -258,7 +225,7 @@ def test_a_run_killed_while_it_finishes_finishes_again(
 
 
 def test_a_sweep_is_ranked_by_falls_and_tilt_of_its_seeds(
-    folder: RunFolder, calls: list[Any], monkeypatch: pytest.MonkeyPatch, finished: Any
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, finished: Any
 ) -> None:
     """Four runs: two values of gamma with two seeds each."""
     monkeypatch.setitem(VALIDATION, SEED, (0, 0.9))

@@ -1,7 +1,6 @@
 """The loop of a run around a stub program: what is logged, saved, stopped and resumed."""
 
 import dataclasses
-import io
 import itertools
 import json
 import os
@@ -11,38 +10,35 @@ import struct
 import threading
 import time
 import types
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
-from tensorboardX.proto.event_pb2 import Event
 
-from mjx_balance.config import PRESETS, Config, TaskConfig
+from mjx_balance.config import PRESETS, Config
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import RunFolder
-from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints, loop
 from mjx_balance.training import run as run_module
-from mjx_balance.training.loop import LEARNER_METRICS, Interrupts, Plan, learn, make_plan, measured
+from mjx_balance.training.loop import STOPPING, Interrupts, Run, learn, measured
 from mjx_balance.training.program_cache import program_key
 
-PLAN = Plan(
-    num_envs=4,
-    num_seeds=1,
-    iterations=5,
-    total=100,
-    decision_s=0.2,
-    sim_steps=50,
-    eval_every=0,
-    checkpoint_seconds=1e9,
-    metrics=LEARNER_METRICS | dict(BalanceEnv.metrics),
-)
 RAW = {"fall": 0.02, "tilt_deg": 0.5, "reward": 0.3, "loss": 0.25, "epsilon": 0.1}
+CONFIG = Config(num_envs=4, num_env_steps=100, log_every=20, eval_every=0, checkpoint_seconds=1e9)
+"""Five calls of 20 decisions."""
+CALLS = [20, 40, 60, 80, 100]
+WEIGHTS = dict(zip(CALLS, (1, 3, 7, 15, 31), strict=True))
+"""Decisions -> weights of the stub."""
+NOWHERE: Any = None
+
+
+def run_of(config: Config = CONFIG, **changes: Any) -> Run:
+    config = dataclasses.replace(config, **changes)
+    spec: Any = types.SimpleNamespace(spec=types.SimpleNamespace(num_envs=config.num_envs))
+    env: Any = BalanceEnv
+    return Run(config, env, spec, NOWHERE, NOWHERE)
 
 
 class State(NamedTuple):
@@ -51,10 +47,9 @@ class State(NamedTuple):
     weights: Any
 
 
-def start(seeds: int | None = None) -> State:
-    if seeds is None:
-        return State(jnp.int32(0), jnp.int32(0), jnp.float32(0.0))
-    return State(*(jnp.zeros(seeds, kind) for kind in (jnp.int32, jnp.int32, jnp.float32)))
+def start(seeds: int = 1) -> Any:
+    shape = () if seeds == 1 else (seeds,)
+    return State(*(jnp.zeros(shape, kind) for kind in (jnp.int32, jnp.int32, jnp.float32)))
 
 
 def step(state: Any, raw: dict[str, Any] | None = None) -> Any:
@@ -64,83 +59,94 @@ def step(state: Any, raw: dict[str, Any] | None = None) -> Any:
     return State(state.env_steps + 20, state.gradient_steps + 3, weights), values
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> RunFolder:
-    return RunFolder(tmp_path)
-
-
-@pytest.fixture
-def display() -> Display:
-    return Display(Console(file=io.StringIO(), width=200))
-
-
-@pytest.fixture
-def stop() -> Iterator[Interrupts]:
-    with Interrupts(lambda said: None) as interrupts:
-        yield interrupts
-
-
 def never(state: Any) -> dict[str, np.ndarray]:
     pytest.fail("nothing is to be validated here")
 
 
-def run(
-    folder: RunFolder,
-    display: Display,
-    stop: Interrupts,
-    program: Callable[[Any], Any] = step,
-    plan: Plan = PLAN,
-    validate: loop.Validate = never,
-) -> Any:
-    """Goes on from the folder's newest checkpoint, as a run does."""
-    saved = checkpoints.restore(folder.checkpoints, start(), pytest.fail)
-    state: Any = saved or start()
-    return learn(plan, program, state, folder, display, stop, validate)[0]
+@pytest.fixture
+def go(folder: RunFolder, display: Any) -> Callable[..., tuple[State, float]]:
+    """Program, validation, changes of the config -> state and seconds of a run.
+
+    It goes on from the folder's newest checkpoint.
+    """
+
+    def go(
+        program: Any = step, validate: loop.Validate = never, **changes: Any
+    ) -> tuple[Any, float]:
+        run = dataclasses.replace(run_of(**changes), folder=folder, display=display)
+        zero = start(run.num_seeds)
+        state = checkpoints.restore(folder.checkpoints, zero, pytest.fail) or zero
+        with Interrupts(display.say) as stop:
+            return learn(run, program, state, stop, validate)
+
+    return go
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time that the loop reads, s; the counter is ten times as fast."""
+    now = [0.0]
+    time = types.SimpleNamespace(monotonic=lambda: now[0], perf_counter=lambda: 10 * now[0])
+    monkeypatch.setattr(loop, "time", time)
+    return now
 
 
 def logged(folder: RunFolder) -> list[dict[str, Any]]:
     return [json.loads(line) for line in folder.metrics.read_text().splitlines()]
 
 
-def test_a_plan_rounds_the_run_up_to_whole_calls() -> None:
-    config = Config(num_envs=64, num_env_steps=1_000, log_every=300, num_seeds=3, eval_every=500)
-    plan = make_plan(config, {})
-    assert (plan.iterations, plan.per_call, plan.total) == (4, 256, 1024)
-    assert (plan.num_envs, plan.num_seeds) == (64, 3)
-    assert (plan.decision_s, plan.sim_steps, plan.checkpoint_seconds) == (0.2, 50, 45)
-    assert plan.eval_every == 500
-    rare = make_plan(Config(num_envs=64, num_env_steps=1_024, log_every=1), {})
+def events(folder: RunFolder) -> Iterator[Any]:
+    """TensorBoard's events, from the record format: length, sum, event, sum."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    for file in sorted(folder.tensorboard.iterdir(), key=lambda file: file.stat().st_mtime_ns):
+        content = file.read_bytes()
+        while content:
+            (length,) = struct.unpack("<Q", content[:8])
+            yield Event.FromString(content[12 : 12 + length])
+            content = content[16 + length :]
+
+
+def drawn(folder: RunFolder, tag: str) -> dict[int, float]:
+    """A curve of TensorBoard; a restarted session drops its steps from the first of its own on."""
+    curve: dict[int, float] = {}
+    for event in events(folder):
+        if event.HasField("session_log"):
+            curve = {step: value for step, value in curve.items() if step < event.step}
+        for value in event.summary.value:
+            if value.tag == tag:
+                assert event.step not in curve
+                curve[event.step] = value.simple_value
+    return curve
+
+
+def test_a_run_is_rounded_up_to_whole_calls() -> None:
+    run = run_of(Config(num_envs=64, num_env_steps=1_000, log_every=300, num_seeds=3))
+    assert (run.iterations, run.per_call, run.total, run.num_seeds) == (4, 256, 1024, 3)
+    rare = run_of(Config(num_envs=64, num_env_steps=1_024, log_every=1))
     assert (rare.iterations, rare.total) == (1, 1024)  # at least one decision a call
-    other = make_plan(Config(num_envs=8, task=TaskConfig(ctrl_dt=0.1, sim_dt=0.002)), {})
-    assert (other.decision_s, other.sim_steps) == (0.1, 50)
 
 
 def test_every_call_is_logged_and_the_end_is_saved(
-    folder: RunFolder, display: Display, stop: Interrupts
+    folder: RunFolder, display: Any, go: Any
 ) -> None:
     def program(state: Any) -> Any:
         """Whoever watches the file sees every line at once."""
         assert len(logged(folder)) == int(state.env_steps) // 20
         return step(state)
 
-    zero: Any = start()
-    state, seconds = learn(PLAN, program, zero, folder, display, stop, never)
+    state, seconds = go(program)
     assert float(state.weights) == 31  # ((((0*2+1)*2+1)*2+1)*2+1)*2+1
-    assert [line["env_steps"] for line in logged(folder)] == [20, 40, 60, 80, 100]
+    assert [line["env_steps"] for line in logged(folder)] == CALLS
     assert [line["gradient_steps"] for line in logged(folder)] == [3, 6, 9, 12, 15]
     assert checkpoints.saved_steps(folder.checkpoints) == [100]
     assert 0 < seconds < 10
-    assert "100/100 decisions" in display.console.file.getvalue()  # pyright: ignore
-    drawn = {
-        value.tag: value.simple_value
-        for event in events(folder)
-        for value in event.summary.value
-        if event.step == 100
-    }
+    assert any("100/100 decisions" in line for line in display.lines)
     last = {name: value for name, value in logged(folder)[-1].items() if "/" in name}
     assert len(last) == 7
     assert "seeds" not in logged(folder)[-1], "there is one"
-    assert drawn == pytest.approx(last, rel=1e-6)
+    for name, value in last.items():
+        assert drawn(folder, name)[100] == pytest.approx(value, rel=1e-6)
 
 
 def test_checkpoints_are_at_most_a_minute_old() -> None:
@@ -148,95 +154,73 @@ def test_checkpoints_are_at_most_a_minute_old() -> None:
 
 
 def test_names_and_units_of_what_is_logged() -> None:
-    metrics, _ = measured({k: np.asarray(v, np.float32) for k, v in RAW.items()}, 0.5, PLAN)
-    assert metrics == pytest.approx(
-        {
-            # 0.02 falls per decision of 0.2 s are 0.1 per second.
-            "train/falls_per_minute": 6.0,
-            "train/tilt_deg": 0.5,
-            "train/reward": 0.3,
-            "train/loss": 0.25,
-            "train/epsilon": 0.1,
-            # 20 decisions of 50 physics steps in half a second.
-            "perf/env_steps_per_second": 40.0,
-            "perf/physics_steps_per_second": 2000.0,
-        },
-        rel=1e-6,
-    )
+    raw = {k: np.asarray(v, np.float32) for k, v in {**RAW, "diverged": 0.1}.items()}
+    wanted = {
+        # 0.02 falls per decision of 0.2 s are 0.1 per second.
+        "train/falls_per_minute": 6.0,
+        "train/tilt_deg": 0.5,
+        "train/reward": 0.3,
+        "train/loss": 0.25,
+        "train/epsilon": 0.1,
+        # A share of 0.1 of 20 decisions.
+        "train/diverged": 2.0,
+        # 20 decisions of 50 physics steps in half a second.
+        "perf/env_steps_per_second": 40.0,
+        "perf/physics_steps_per_second": 2000.0,
+    }
+    assert measured(run_of(), raw, 0.5)[0] == pytest.approx(wanted, rel=1e-6)
+    task = dataclasses.replace(CONFIG.task, ctrl_dt=0.1)
+    wanted |= {"train/falls_per_minute": 12.0, "perf/physics_steps_per_second": 1000.0}
+    assert measured(run_of(task=task), raw, 0.5)[0] == pytest.approx(wanted, rel=1e-6)
 
 
 def test_several_seeds_are_averaged_and_listed() -> None:
-    raw = {k: np.asarray([v, 3 * v], np.float32) for k, v in RAW.items()}
-    metrics, seeds = measured(raw, 0.5, PLAN._replace(num_seeds=2))
+    """Before the first update there is no loss; one seed may have none, and be listed so."""
+    raw = {k: np.asarray([v, 3 * v]) for k, v in RAW.items()}
+    raw |= {"loss": np.asarray([np.nan, 4.0]), "reward": np.asarray([np.nan, np.inf])}
+    metrics, seeds = measured(run_of(num_seeds=2), raw, 0.5)
     assert metrics["train/tilt_deg"] == pytest.approx(1.0)
     assert metrics["perf/env_steps_per_second"] == pytest.approx(80)
-    assert set(seeds) == {"tilt_deg", "falls_per_minute", "reward", "loss"}
-    assert seeds["falls_per_minute"] == pytest.approx([6.0, 18.0], rel=1e-6)
-
-
-def test_what_was_not_measured_is_left_out() -> None:
-    """Before the first update there is no loss; one seed may have none, and be said so."""
-    metrics, _ = measured({**RAW, "loss": np.float32(np.nan)}, 0.5, PLAN)  # pyright: ignore
-    assert "train/loss" not in metrics
-    assert "train/tilt_deg" in metrics
-    raw = {k: np.asarray([v, 3 * v]) for k, v in RAW.items()}
-    raw["loss"] = np.asarray([np.nan, 4.0])
-    raw["reward"] = np.asarray([np.nan, np.inf])
-    metrics, seeds = measured(raw, 0.5, PLAN._replace(num_seeds=2))
     assert metrics["train/loss"] == 4
-    assert seeds["loss"] == [None, 4.0]
     assert "train/reward" not in metrics
-    assert "reward" not in seeds
-    json.dumps([metrics, seeds], allow_nan=False)
+    assert seeds.pop("falls_per_minute") == pytest.approx([6.0, 18.0])
+    assert seeds == {"tilt_deg": [0.5, 1.5], "loss": [None, 4.0]}
 
 
-def test_diverged_envs_are_counted(folder: RunFolder, display: Display, stop: Interrupts) -> None:
-    """A share of 0.1 of 20 decisions is 2 envs; the watcher is told, once there are any."""
-    run(folder, display, stop, lambda state: step(state, RAW | {"diverged": 0.1}))
-    assert logged(folder)[0]["train/diverged"] == pytest.approx(2)
-    said = display.console.file.getvalue()  # pyright: ignore
-    assert "diverged envs 2" in said
-    metrics, _ = measured({**RAW, "diverged": np.float32(0)}, 0.5, PLAN)  # pyright: ignore
-    assert metrics["train/diverged"] == 0
+def test_diverged_envs_are_shown(display: Any, go: Any) -> None:
+    go(lambda state: step(state, RAW | {"diverged": 0.1}))
+    assert any("diverged envs 2" in line for line in display.lines)
 
 
 @pytest.mark.parametrize(
     ("every", "steps"),
-    [(2.5, [60, 100]), (2.0, [80, 100]), (1e-9, [80, 100]), (1e9, [100])],
+    [(2.5, [60, 100]), (2.0, [40, 80, 100]), (1e-9, CALLS), (1e9, [100])],
 )
 def test_checkpoints_come_by_the_clock(
     every: float,
     steps: list[int],
     folder: RunFolder,
-    display: Display,
-    stop: Interrupts,
+    go: Any,
+    clock: list[float],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Every call takes a second: saved after each 2.5 s means after the third, the sixth, ..."""
-    now = [0.0]
-    clock = types.SimpleNamespace(monotonic=lambda: now[0], perf_counter=lambda: 10 * now[0])
-    monkeypatch.setattr(loop, "time", clock)
-    saved: list[int] = []
-    save = checkpoints.save
+    saved, save = [], checkpoints.save
 
-    def remember(directory: Path, done: int, *state: Any) -> None:
+    def remember(directory: Any, done: int, *state: Any) -> None:
         saved.append(done)
         save(directory, done, *state)
 
     monkeypatch.setattr(checkpoints, "save", remember)
 
     def second(state: Any) -> Any:
-        now[0] += 1
+        clock[0] += 1
         return step(state)
 
-    zero: Any = start()
-    plan = PLAN._replace(checkpoint_seconds=every)
-    learnt = learn(plan, second, zero, folder, display, stop, never)
-    assert learnt[1] == pytest.approx(50)
+    assert go(second, checkpoint_seconds=every)[1] == pytest.approx(50)
     assert logged(folder)[3]["perf/env_steps_per_second"] == pytest.approx(2)
-    assert checkpoints.saved_steps(folder.checkpoints) == steps
-    if every == 2.0:
-        assert saved == [40, 80, 100]
+    assert list(dict.fromkeys(saved)) == steps
+    assert checkpoints.saved_steps(folder.checkpoints) == steps[-2:]
 
 
 class Killed(BaseException):
@@ -254,155 +238,46 @@ def killed_after(calls: int) -> Callable[[Any], Any]:
     return program
 
 
-@pytest.mark.parametrize("calls", [0, 1, 3])
-@pytest.mark.parametrize("every", [1e9, 1e-9])
-def test_a_killed_run_goes_on_to_the_same_end(
-    calls: int, every: float, folder: RunFolder, display: Display, stop: Interrupts
-) -> None:
-    """Before the first checkpoint (every 1e9 s) and after one (after every call)."""
-    plan = PLAN._replace(checkpoint_seconds=every)
-    with pytest.raises(Killed):
-        run(folder, display, stop, killed_after(calls), plan)
-    assert len(logged(folder)) == calls
-    with folder.metrics.open("a") as log:
-        log.write('{"env_st')  # torn
-    seen: list[int] = []
-
-    def watched(state: Any) -> Any:
-        seen.append(int(state.env_steps))
-        return step(state)
-
-    state = run(folder, display, stop, watched, plan)
-    assert float(state.weights) == 31
-    assert seen[0] == (20 * calls if every < 1 else 0)
-    assert [line["env_steps"] for line in logged(folder)] == [20, 40, 60, 80, 100]
-    assert_curves_run_once(folder)
-
-
-def events(folder: RunFolder) -> Iterator[Event]:
-    """What TensorBoard reads, from the record format: length, sum, event, sum."""
-    for file in sorted(folder.tensorboard.iterdir(), key=lambda file: file.stat().st_mtime_ns):
-        content = file.read_bytes()
-        while content:
-            (length,) = struct.unpack("<Q", content[:8])
-            yield Event.FromString(content[12 : 12 + length])
-            content = content[16 + length :]
-
-
-def assert_curves_run_once(folder: RunFolder) -> None:
-    """A restarted session drops what was logged from its first step on (TensorBoard's rule)."""
-    curve: list[int] = []
-    for event in events(folder):
-        if event.HasField("session_log"):
-            curve = [step for step in curve if step < event.step]
-        if any(value.tag == "train/tilt_deg" for value in event.summary.value):
-            curve.append(event.step)
-    assert curve == [20, 40, 60, 80, 100]
-
-
-def test_a_complete_run_is_only_passed_through(
-    folder: RunFolder, display: Display, stop: Interrupts
-) -> None:
-    run(folder, display, stop)
-    before = folder.metrics.read_text()
-    assert float(run(folder, display, stop, killed_after(0)).weights) == 31
-    assert folder.metrics.read_text() == before
-
-
-def test_an_interrupt_stops_after_the_call_and_saves(folder: RunFolder, display: Display) -> None:
-    def program(state: Any) -> Any:
-        if int(state.env_steps) == 20:
-            os.kill(os.getpid(), signal.SIGINT)
-        return step(state)
-
-    with Interrupts(display.say) as stop:
-        state = run(folder, display, stop, program)
-        assert stop
-    assert int(state.env_steps) == 40
-    assert checkpoints.saved_steps(folder.checkpoints) == [40]
-    assert float(run(folder, display, Interrupts(display.say)).weights) == 31
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_is_answered_while_the_call_goes_on(number: int) -> None:
-    said: list[str] = []
-    answered = threading.Event()
-
-    def say(line: str) -> None:
-        said.append(line)
-        answered.set()
-
+def test_an_interrupt_is_answered_while_the_call_goes_on(number: int, display: Any) -> None:
     def call(argument: int) -> int:
         os.kill(os.getpid(), number)
-        assert answered.wait(10)
-        time.sleep(2.5 * loop.ANSWER_S)  # and not said again
+        wait_for_answer(display)
+        time.sleep(2.5 * loop.ANSWER_S)  # and not answered again
         return argument + 1
 
     def handler(number: int, frame: object) -> None:
         pytest.fail("not this one")
 
     before = signal.signal(number, handler)
-    with Interrupts(say) as stop:
+    with Interrupts(display.say) as stop:
         assert not stop
         assert stop.run(call, 1) == 2
         assert stop
     assert signal.signal(number, before) is handler
-    assert len(said) == 1
-    assert said[0].startswith("stopping after this call and saving; interrupt again to quit")
+    assert display.lines == [STOPPING]
+    assert STOPPING.startswith("stopping after this call and saving; interrupt again to quit")
 
 
-def test_a_second_interrupt_does_not_wait_for_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor does the end of the process, where Python would wait for the program or abort."""
-    left: list[Any] = []
-    monkeypatch.setattr(loop.atexit, "register", lambda *call: left.append(call))
-    monkeypatch.setattr(os, "_exit", lambda code: left.append(code))
-    goes_on = threading.Event()
-
-    def call() -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.3)
-        os.kill(os.getpid(), signal.SIGINT)
-        goes_on.wait(20)
-
-    began = time.monotonic()
-    with Interrupts(lambda said: None) as stop, pytest.raises(KeyboardInterrupt):
-        stop.run(call)
-    assert time.monotonic() - began < 5
-    [(leave, future)] = left
-    leave(future)
-    assert left[1:] == [130]
-    goes_on.set()
-    future.result(5)
-    leave(future)
-    assert len(left) == 2  # nothing runs any more: an ordinary end
+def wait_for_answer(display: Any) -> None:
+    until = time.monotonic() + 10
+    while STOPPING not in display.lines:
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 @pytest.mark.parametrize("error", [ValueError("no"), TimeoutError("late"), Killed()])
-def test_what_a_call_raises_is_raised(error: BaseException, stop: Interrupts) -> None:
+def test_what_a_call_raises_is_raised(error: BaseException) -> None:
     def call() -> None:
         raise error
 
-    with pytest.raises(type(error)) as raised:
+    with Interrupts(pytest.fail) as stop, pytest.raises(type(error)) as raised:
         stop.run(call)
     assert raised.value is error
 
 
-def test_seeds_count_their_decisions_together(
-    folder: RunFolder, display: Display, stop: Interrupts
-) -> None:
-    raw = {k: [v, v] for k, v in RAW.items()}
-    plan = PLAN._replace(num_seeds=2)
-    two: Any = start(2)
-    state: Any
-    state, _ = learn(plan, lambda state: step(state, raw), two, folder, display, stop, never)
-    np.testing.assert_array_equal(jax.device_get(state.weights), (31, 31))
-    lines = logged(folder)
-    assert [line["env_steps"] for line in lines] == [20, 40, 60, 80, 100]
-    assert lines[0]["seeds"]["loss"] == [0.25, 0.25]
-
-
 def validating(folder: RunFolder, die: str = "", at: int = 0) -> loop.Validate:
-    """Validates the stub's weights: keeps them in a file, and finds a tilt of 1 / weights.
+    """Validates the stub's weights: writes them into a file, and returns a tilt of 1 / weights.
 
     Args:
       folder: of the run.
@@ -424,61 +299,44 @@ def validating(folder: RunFolder, die: str = "", at: int = 0) -> loop.Validate:
     return validate
 
 
-def kept(folder: RunFolder) -> dict[int, str]:
-    """What was kept of the validations, by decisions."""
+def validated(folder: RunFolder) -> dict[int, str]:
+    """Weights of the validated policies, by decisions."""
     return {int(file.parent.name): file.read_text() for file in folder.validated.glob("*/*")}
 
 
 def held_out(folder: RunFolder) -> dict[int, float]:
-    return {
-        line["env_steps"]: line["eval/paper/tilt_mean"]
-        for line in logged(folder)
-        if "eval/paper/tilt_mean" in line
-    }
+    name = "eval/paper/tilt_mean"
+    return {line["env_steps"]: line[name] for line in logged(folder) if name in line}
 
 
 @pytest.mark.parametrize(
-    ("every", "steps"),
-    [(0, []), (1, [20, 40, 60, 80, 100]), (50, [60, 100]), (45, [60, 100]), (70, [80, 100])],
+    ("every", "steps"), [(0, []), (1, CALLS), (50, [60, 100]), (45, [60, 100]), (70, [80, 100])]
 )
 def test_validations_come_by_the_decisions_and_at_the_end(
-    every: int, steps: list[int], folder: RunFolder, display: Display, stop: Interrupts
+    every: int, steps: list[int], folder: RunFolder, go: Any
 ) -> None:
     """A call is 20 decisions: after the first that reaches 50 there are 60. The end is one more."""
-    plan = PLAN._replace(eval_every=every)
-    state = run(folder, display, stop, plan=plan, validate=validating(folder))
+    state, _ = go(validate=validating(folder), eval_every=every)
     assert float(state.weights) == 31
-    assert [line["env_steps"] for line in logged(folder)] == [20, 40, 60, 80, 100]
-    weights = {20: 1, 40: 3, 60: 7, 80: 15, 100: 31}
-    assert held_out(folder) == {n: pytest.approx(1 / weights[n]) for n in steps}
-    drawn = {
-        event.step: value.simple_value
-        for event in events(folder)
-        for value in event.summary.value
-        if value.tag == "eval/paper/tilt_mean"
-    }
-    assert drawn == pytest.approx(held_out(folder), rel=1e-6)
+    assert [line["env_steps"] for line in logged(folder)] == CALLS
+    assert held_out(folder) == {n: pytest.approx(1 / WEIGHTS[n]) for n in steps}
+    assert drawn(folder, "eval/paper/tilt_mean") == pytest.approx(held_out(folder), rel=1e-6)
 
 
 def test_validations_take_no_time_from_the_decisions(
-    folder: RunFolder, display: Display, stop: Interrupts, monkeypatch: pytest.MonkeyPatch
+    folder: RunFolder, go: Any, clock: list[float]
 ) -> None:
     """A call takes 2 s and a validation half a second: 10 decisions/s, and shares of the time."""
-    now = [0.0]
-    clock = types.SimpleNamespace(monotonic=lambda: now[0], perf_counter=lambda: now[0])
-    monkeypatch.setattr(loop, "time", clock)
 
     def program(state: Any) -> Any:
-        now[0] += 2
+        clock[0] += 0.2
         return step(state)
 
     def validate(state: Any) -> dict[str, np.ndarray]:
-        now[0] += 0.5
+        clock[0] += 0.05
         return {"eval/paper/falls": np.asarray([3.0])}
 
-    zero: Any = start()
-    plan = PLAN._replace(eval_every=40)
-    assert learn(plan, program, zero, folder, display, stop, validate)[1] == pytest.approx(10)
+    assert go(program, validate, eval_every=40)[1] == pytest.approx(10)
     lines = logged(folder)
     assert [line["perf/env_steps_per_second"] for line in lines] == pytest.approx([10] * 5)
     shares = {x["env_steps"]: x.get("perf/validation_share") for x in lines}
@@ -488,96 +346,95 @@ def test_validations_take_no_time_from_the_decisions(
     assert lines[1]["eval/paper/falls"] == 3
 
 
-def test_validations_of_several_seeds_are_averaged_and_listed(
-    folder: RunFolder, display: Display, stop: Interrupts
+def test_several_seeds_count_their_decisions_and_validate_together(
+    folder: RunFolder, go: Any
 ) -> None:
     """A seed that has diverged has no value; the others have."""
     raw = {k: [v, v, v] for k, v in RAW.items()}
-    plan = PLAN._replace(num_seeds=3, eval_every=100)
-    three: Any = start(3)
-    found = {"eval/corner/falls": np.asarray([4, np.nan, 1]), "eval/x": np.full(3, np.nan)}
-    learn(plan, lambda s: step(s, raw), three, folder, display, stop, lambda state: found)
-    lines = logged(folder)
-    assert lines[-1]["eval/corner/falls"] == 2.5
-    assert lines[-1]["seeds"]["eval/corner/falls"] == [4, None, 1]
-    assert "eval/x" not in lines[-1]
-    assert "eval/x" not in lines[-1]["seeds"]
-    assert "eval/corner/falls" not in lines[0]["seeds"]
-    assert lines[-1]["seeds"]["loss"] == [0.25, 0.25, 0.25]
+    values = {"eval/corner/falls": np.asarray([4, np.nan, 1]), "eval/x": np.full(3, np.nan)}
+    state, _ = go(lambda s: step(s, raw), lambda state: values, num_seeds=3, eval_every=100)
+    assert state.weights.tolist() == [31, 31, 31]
+    first, *_, last = logged(folder)
+    assert (first["env_steps"], last["env_steps"]) == (20, 100)
+    assert "eval/corner/falls" not in first["seeds"]
+    assert last["eval/corner/falls"] == 2.5
+    assert last["seeds"]["eval/corner/falls"] == [4, None, 1]
+    assert last["seeds"]["loss"] == [0.25, 0.25, 0.25]
+    assert "eval/x" not in {*last, *last["seeds"]}
 
 
 @pytest.mark.parametrize("every", [1e9, 1e-9])
 @pytest.mark.parametrize(
     ("calls", "die", "at"),
-    [(9, "before", 60), (9, "after", 60), (3, "", 0), (4, "", 0), (9, "after", 100)],
+    [
+        *((calls, "", 0) for calls in (0, 1, 3, 4)),
+        *((9, die, at) for die, at in (("before", 60), ("after", 60), ("after", 100))),
+    ],
 )
-def test_a_run_killed_about_a_validation_validates_as_an_undisturbed_one(
-    calls: int,
-    die: str,
-    at: int,
-    every: float,
-    folder: RunFolder,
-    display: Display,
-    stop: Interrupts,
+def test_a_killed_run_goes_on_to_the_same_end(
+    calls: int, die: str, at: int, every: float, folder: RunFolder, go: Any
 ) -> None:
-    """In it, before or after it keeps its policy, or in a later call, with and without checkpoint.
+    """In a call, before or after a validated policy is written, with and without a checkpoint.
 
-    What it kept of a history that is lost is gone, whatever the decisions it belonged to.
+    Lines and policies of a history that is lost are gone, whatever the decisions they belong to.
     """
-    plan = PLAN._replace(checkpoint_seconds=every, eval_every=30)
+    changes = {"checkpoint_seconds": every, "eval_every": 30}
     with pytest.raises(Killed):
-        run(folder, display, stop, killed_after(calls), plan, validating(folder, die, at))
+        go(killed_after(calls), validating(folder, die, at), **changes)
+    done = min(calls, at // 20 - 1 if at else 9)
+    assert len(logged(folder)) == done
+    with folder.metrics.open("a") as log:
+        log.write('{"env_st')  # torn
     stray = folder.validated_policy(0, 110)
     stray.parent.mkdir(parents=True, exist_ok=True)
     stray.write_text("of another history")
     seen: list[dict[int, str]] = []
 
     def watched(state: Any) -> Any:
-        seen.append(kept(folder))
+        if not seen:
+            assert int(state.env_steps) == (20 * done if every < 1 else 0)
+        seen.append(validated(folder))
         return step(state)
 
-    state = run(folder, display, stop, watched, plan, validating(folder))
-    assert float(state.weights) == 31
-    assert kept(folder) == {40: "3.0", 60: "7.0", 100: "31.0"}
+    assert float(go(watched, validating(folder), **changes)[0].weights) == 31
+    assert validated(folder) == {40: "3.0", 60: "7.0", 100: "31.0"}
     assert held_out(folder) == pytest.approx({40: 1 / 3, 60: 1 / 7, 100: 1 / 31})
-    assert [line["env_steps"] for line in logged(folder)] == [20, 40, 60, 80, 100]
-    saved = (min(calls, at // 20 - 1 if at else 9) * 20) if every < 1 else 0
-    assert sorted(seen[0]) == [n for n in (40, 60, 100) if n <= saved]
+    assert [line["env_steps"] for line in logged(folder)] == CALLS
+    assert list(drawn(folder, "train/tilt_deg")) == CALLS
+    assert sorted(seen[0]) == [n for n in (40, 60, 100) if n <= 20 * done and every < 1]
+    before = folder.metrics.read_text()
+    assert float(go(killed_after(0), **changes)[0].weights) == 31, "a complete run is left alone"
+    assert folder.metrics.read_text() == before
 
 
-def test_an_interrupt_during_a_validation_is_answered_and_the_line_is_whole(
-    folder: RunFolder,
+def test_an_interrupt_stops_after_the_call_and_its_validation_and_saves(
+    folder: RunFolder, display: Any, go: Any
 ) -> None:
-    answered = threading.Event()
-    display = Display(Console(file=io.StringIO(), width=200))
-    said: list[str] = []
-
-    def say(line: str) -> None:
-        said.append(line)
-        answered.set()
-
-    def validate(state: Any) -> Mapping[str, np.ndarray]:
+    def validate(state: Any) -> Any:
         if int(state.env_steps) == 40:
             os.kill(os.getpid(), signal.SIGINT)
-            assert answered.wait(10)
+            wait_for_answer(display)
         return validating(folder)(state)
 
-    plan = PLAN._replace(eval_every=40)
-    with Interrupts(say) as stop:
-        run(folder, display, stop, step, plan, validate)
-    assert len(said) == 1
-    assert said[0].startswith("stopping after this call and saving")
+    state, _ = go(validate=validate, eval_every=40)
+    assert int(state.env_steps) == 40
+    assert display.lines == [STOPPING]
     assert held_out(folder) == {40: pytest.approx(1 / 3)}
     assert checkpoints.saved_steps(folder.checkpoints) == [40]
-    run(folder, display, Interrupts(say), step, plan, validating(folder))
+    assert float(go(validate=validating(folder), eval_every=40)[0].weights) == 31
     assert list(held_out(folder)) == [40, 80, 100]
 
 
-def test_a_second_interrupt_does_not_wait_for_the_validation(
-    folder: RunFolder, display: Display, monkeypatch: pytest.MonkeyPatch
+def test_a_second_interrupt_does_not_wait_for_the_call(
+    folder: RunFolder, go: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it would have said is not logged, nor is its call saved: both come again."""
-    monkeypatch.setattr(loop.atexit, "register", lambda *call: None)
+    """Nor does the end of the process, where Python would wait for the program or abort.
+
+    The call in which it comes is neither logged nor saved: it comes again.
+    """
+    left: list[Any] = []
+    monkeypatch.setattr(loop.atexit, "register", lambda *call: left.append(call))
+    monkeypatch.setattr(os, "_exit", lambda code: left.append(code))
     goes_on = threading.Event()
 
     def validate(state: Any) -> dict[str, np.ndarray]:
@@ -587,68 +444,64 @@ def test_a_second_interrupt_does_not_wait_for_the_validation(
         goes_on.wait(20)
         return {}
 
-    plan = PLAN._replace(eval_every=40)
-    with Interrupts(lambda said: None) as stop, pytest.raises(KeyboardInterrupt):
-        run(folder, display, stop, step, plan, validate)
-    goes_on.set()
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        go(validate=validate, eval_every=40)
+    assert time.monotonic() - began < 5
     assert [line["env_steps"] for line in logged(folder)] == [20]
     assert checkpoints.saved_steps(folder.checkpoints) == []
+    left = [call for call in left if call[0] is loop._leave]  # TensorBoard's writers also register
+    [(leave, future)] = left
+    leave(future)
+    assert left[1:] == [130]
+    goes_on.set()
+    future.result(5)
+    leave(future)
+    assert len(left) == 2  # nothing runs any more: an ordinary end
 
 
-class Learner:
-    """Of runs of 64 envs, 16 decisions a call; its state says where it began."""
+def test_a_run_begins_at_its_newest_checkpoint(
+    folder: RunFolder, display: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 64 envs, 16 decisions a call."""
+    keys: list[str] = []
+    seeds: list[int] = []
 
-    def __init__(self) -> None:
-        self.seeds: list[int] = []
+    def compile_program(program: Any, state: Any, key: str, say: Any) -> Any:
+        keys.append(key)
+        return program
 
-    def init(self, seed: int) -> State:
-        self.seeds.append(seed)
-        return start()
-
-    def train_program(self, iterations: int) -> Callable[[Any], Any]:
-        assert iterations == 16
-
+    def train_program(iterations: int) -> Any:
         def program(state: State) -> Any:
             after, raw = step(state)
             return after._replace(env_steps=state.env_steps + 64 * iterations), raw
 
         return program
 
-
-@pytest.fixture
-def compiled(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Keys of the programs that were compiled."""
-    keys: list[str] = []
-
-    def compile_program(program: Any, state: Any, key: str, say: Any) -> Any:
-        keys.append(key)
-        return program
+    def init(seed: int) -> State:
+        seeds.append(seed)
+        return start()
 
     monkeypatch.setattr(run_module.program_cache, "compile_program", compile_program)
-    return keys
+    spec = types.SimpleNamespace(num_envs=64)
+    learner: Any = types.SimpleNamespace(spec=spec, init=init, train_program=train_program)
+    config = dataclasses.replace(PRESETS["smoke"], num_env_steps=4_096, num_devices=1, seed=5)
+    env: Any = BalanceEnv
+    run = Run(config, env, learner, folder, display)
 
+    def go_on() -> float:
+        with Interrupts(display.say) as stop:
+            state, program = run_module.prepare(run, stop)
+            return float(learn(run, program, state, stop, lambda state: {})[0].weights)
 
-def test_a_run_begins_at_its_newest_checkpoint(
-    folder: RunFolder, display: Display, stop: Interrupts, compiled: list[str]
-) -> None:
-    sized = dataclasses.replace(PRESETS["smoke"], num_env_steps=4_096, num_devices=1, seed=5)
-    learner: Any = Learner()
-    env: Any = None
-
-    def go_on() -> Any:
-        plan = make_plan(sized, BalanceEnv.metrics)
-        setup = run_module.Setup(sized, env, learner)
-        state, program = run_module.prepare(setup, plan, folder, display, stop)
-        return learn(plan, program, state, folder, display, stop, lambda state: {})[0]
-
-    third = State(jnp.int32(3_072), jnp.int32(9), jnp.float32(100))
     checkpoints.save(folder.checkpoints, 1_024, start())
+    third = State(jnp.int32(3_072), jnp.int32(9), jnp.float32(100))
     checkpoints.save(folder.checkpoints, 3_072, third)
-    assert float(go_on().weights) == 201  # one call from the newest, 2 * 100 + 1
-    assert learner.seeds == [5]
-    assert compiled == [program_key(sized, 16, "mjx_balance.training.sizing")]
-    assert "resuming at 3,072 decisions" in display.console.file.getvalue()  # pyright: ignore
-    assert float(go_on().weights) == 201
-    assert len(compiled) == 1, "a complete run needs no program"
+    assert go_on() == 201  # one call from the newest, 2 * 100 + 1
+    assert seeds == [5]
+    assert keys == [program_key(config, 16, "mjx_balance.training.sizing")]
+    assert "resuming at 3,072 decisions" in display.lines
+    assert go_on() == 201
+    assert len(keys) == 1, "a complete run needs no program"
     shutil.rmtree(folder.checkpoints)
-    assert float(go_on().weights) == 15  # four calls from nothing
+    assert go_on() == 15  # four calls from nothing

@@ -1,5 +1,6 @@
 """Processes that meet over sockets among strangers, and miss one another: here they are threads."""
 
+import contextlib
 import socket
 import threading
 import time
@@ -21,47 +22,48 @@ def address() -> Address:
         return server.getsockname()
 
 
-@pytest.fixture
-def at_once() -> Callable[..., list[Any]]:
-    """Calls -> what each of them, in a thread of its own, returns or raises within 40 s."""
+def at_once(*calls: Callable[[], Any]) -> list[Any]:
+    """What each of the calls, in a thread of its own, returns or raises within 40 s."""
+    outcomes: list[Any] = [TimeoutError("it hangs")] * len(calls)
 
-    def at_once(*calls: Callable[[], Any]) -> list[Any]:
-        outcomes: list[Any] = [TimeoutError("it hangs")] * len(calls)
+    def work(k: int) -> None:
+        try:
+            outcomes[k] = calls[k]()
+        except Exception as error:
+            outcomes[k] = error
 
-        def work(k: int) -> None:
-            try:
-                outcomes[k] = calls[k]()
-            except Exception as error:
-                outcomes[k] = error
-
-        threads = [threading.Thread(target=work, args=(k,), daemon=True) for k in range(len(calls))]
-        until = time.monotonic() + 40
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(max(0.0, until - time.monotonic()))
-        return outcomes
-
-    return at_once
+    threads = [threading.Thread(target=work, args=(k,), daemon=True) for k in range(len(calls))]
+    until = time.monotonic() + 40
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(max(0.0, until - time.monotonic()))
+    return outcomes
 
 
 @pytest.fixture
 def opened() -> Iterator[list[socket.socket]]:
     """Connections to close at the end."""
-    connections: list[socket.socket] = []
-    yield connections
-    for connection in connections:
-        connection.close()
+    with contextlib.ExitStack() as stack:
+        connections: list[socket.socket] = []
+        yield connections
+        for connection in connections:
+            stack.enter_context(connection)
 
 
-def come(address: Address, index: int, count: int, opened: Any, patience_s: float = 20) -> Any:
-    """What a process gets to know of all."""
-    if index:
-        connections, everyone = visit(address, index, count, f"about {index}", patience_s)
-    else:
-        connections, everyone = host(address, count, "about 0", patience_s)
-    opened += connections.values()
-    return everyone
+@pytest.fixture
+def come(address: Address, opened: list[socket.socket]) -> Callable[..., Any]:
+    """Index, count -> what a process gets to know of all."""
+
+    def come(index: int, count: int, patience_s: float = 20, at: Address = address) -> Any:
+        if index:
+            connections, everyone = visit(at, index, count, f"about {index}", patience_s)
+        else:
+            connections, everyone = host(at, count, "about 0", patience_s)
+        opened.extend(connections.values())
+        return everyone
+
+    return come
 
 
 def message(outcome: Any) -> str:
@@ -69,30 +71,30 @@ def message(outcome: Any) -> str:
     return str(outcome)
 
 
-def test_all_get_to_know_of_all(address: Address, at_once: Any, opened: Any) -> None:
-    calls = [lambda k=k: come(address, k, 3, opened) for k in (2, 1, 0)]
+def test_all_get_to_know_of_all(come: Any) -> None:
+    calls = [lambda k=k: come(k, 3) for k in (2, 1, 0)]
     assert at_once(*calls) == [["about 0", "about 1", "about 2"]] * 3
 
 
-def test_nobody_waits_for_ever(address: Address, at_once: Any, opened: Any) -> None:
+def test_nobody_waits_for_ever(address: Address, come: Any) -> None:
     where = f"127.0.0.1 port {address[1]}"
-    outcomes = at_once(*(lambda k=k: come(address, k, 3, opened, 1) for k in (0, 2)))
+    outcomes = at_once(*(lambda k=k: come(k, 3, 1) for k in (0, 2)))
     assert [message(x) for x in outcomes] == [f"process 1 has not come to {where} in 1 s"] * 2
-    [outcome] = at_once(lambda: come(address, 1, 2, opened, 0.5))
+    [outcome] = at_once(lambda: come(1, 2, 0.5))
     assert f"process 0 does not answer at {where} within 0.5 s" in message(outcome)
 
 
 @pytest.mark.parametrize(("index", "count"), [(1, 3), (2, 4)])
 def test_processes_that_count_differently_are_refused(
-    index: int, count: int, address: Address, at_once: Any, opened: Any
+    index: int, count: int, address: Address, come: Any
 ) -> None:
     """Two with the same number, and one that knows of another number of them."""
 
     def late() -> Any:
         time.sleep(0.6)
-        return come(address, index, count, opened)
+        return come(index, count)
 
-    outcomes = at_once(*(lambda k=k: come(address, k, 3, opened) for k in (0, 1)), late)
+    outcomes = at_once(*(lambda k=k: come(k, 3) for k in (0, 1)), late)
     [sentence] = {message(x) for x in outcomes}
     assert sentence == (
         f"a process came to 127.0.0.1 port {address[1]} as number {index} of {count}; process 0 "
@@ -121,55 +123,45 @@ GREETING = b'{"program": "mjx_balance", '
     ],
     ids="idle http list count text number nested endless slow words lists empty".split(),
 )
-@pytest.mark.parametrize("strangers", [1, 4])
-def test_a_stranger_neither_ends_nor_blocks_the_meeting(
-    lines: list[bytes], strangers: int, address: Address, at_once: Any, opened: Any
+def test_strangers_neither_end_nor_block_the_meeting(
+    lines: list[bytes], address: Address, opened: Any, come: Any
 ) -> None:
     def stranger() -> None:
-        for _ in range(200):
-            try:
+        connection = None
+        while connection is None:  # until the first listens
+            with contextlib.suppress(OSError):
                 connection = socket.create_connection(address)
-                break
-            except OSError:
-                time.sleep(0.05)
-        else:
-            pytest.fail("nobody listens")
         opened.append(connection)
-        try:
+        with contextlib.suppress(OSError):  # it has been dropped
             for line in lines:
                 connection.sendall(line)
                 time.sleep(0.1)
-        except OSError:
-            pass  # it has been dropped
 
     def second() -> Any:
         time.sleep(0.5)
-        return come(address, 1, 2, opened)
+        return come(1, 2)
 
     began = time.monotonic()
-    first = lambda: come(address, 0, 2, opened)  # noqa: E731
-    met = at_once(first, second, *[stranger] * strangers)[:2]
-    assert met == [["about 0", "about 1"]] * 2
+    met, *_ = outcomes = at_once(lambda: come(0, 2), second, *[stranger] * 4)
+    assert outcomes == [met, met, *[None] * 4]
+    assert met == ["about 0", "about 1"]
     assert time.monotonic() - began < 15
 
 
-def test_only_the_coordinators_address_is_listened_at(
-    address: Address, at_once: Any, opened: Any
-) -> None:
+def test_only_the_coordinators_address_is_listened_at(address: Address, come: Any) -> None:
     def elsewhere() -> str:
         time.sleep(0.5)
         with socket.create_connection(("127.0.0.2", address[1])):
             return "heard"
 
-    outcomes = at_once(lambda: come(address, 0, 2, opened, 1), elsewhere)
+    outcomes = at_once(lambda: come(0, 2, 1), elsewhere)
     assert type(outcomes[1]) is ConnectionRefusedError
 
 
-def test_a_port_that_is_taken_is_said(at_once: Any, opened: Any) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        [outcome] = at_once(lambda: come(("127.0.0.1", port), 0, 2, opened))
-    where = f"127.0.0.1 port {port}"
+def test_a_port_that_is_taken_is_named(address: Address, come: Any) -> None:
+    with socket.create_server(address):
+        [outcome] = at_once(lambda: come(0, 2))
+    where = f"127.0.0.1 port {address[1]}"
     assert message(outcome) == f"process 0 cannot listen at {where}: Address already in use"
 
 
@@ -178,6 +170,7 @@ def exits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Exit codes of the processes that would have ended."""
     codes: list[int] = []
     monkeypatch.setattr(meeting.os, "_exit", codes.append)
+    monkeypatch.setattr(meeting, "KEEP_ALIVE", {})  # pairs of sockets are no TCP
     return codes
 
 
@@ -191,19 +184,12 @@ def pairs() -> Iterator[list[tuple[socket.socket, socket.socket]]]:
             end.close()
 
 
-@pytest.fixture
-def tcp_options(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pairs of sockets that are no TCP know none of its options."""
-    monkeypatch.setattr(meeting, "KEEP_ALIVE", {})
-
-
 def wait_for(condition: Callable[[], object]) -> None:
     until = time.monotonic() + 10
     while not condition() and time.monotonic() < until:
         time.sleep(0.01)
 
 
-@pytest.mark.usefixtures("tcp_options")
 def test_a_lost_process_ends_all_with_a_sentence(
     pairs: Any, exits: list[int], capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -219,7 +205,6 @@ def test_a_lost_process_ends_all_with_a_sentence(
     assert capfd.readouterr().err.splitlines() == [sentence] * 2
 
 
-@pytest.mark.usefixtures("tcp_options")
 def test_processes_may_leave_once_the_run_has_ended(pairs: Any, exits: list[int]) -> None:
     (to_1, at_1), _ = pairs
     watch = Watch({1: to_1})

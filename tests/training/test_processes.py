@@ -3,15 +3,15 @@
 import os
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mjx_balance.training import cluster, processes
-from mjx_balance.training.cluster import find_cluster, resolve, share_machine
+from mjx_balance.training import processes
 from mjx_balance.training.meeting import ProcessError
-from mjx_balance.training.processes import ALONE, Processes
+from mjx_balance.training.processes import ALONE, Processes, find_cluster, resolve, share_machine
 
 CLUSTERS = "SLURM OMPI KUBERNETES JAX_COORDINATOR".split()
 Together = Callable[[int, Callable[[Processes], Any]], list[Any]]
@@ -24,7 +24,6 @@ def together(monkeypatch: pytest.MonkeyPatch) -> Together:
     def together(count: int, work: Callable[[Processes], Any]) -> list[Any]:
         given: list[Any] = [None] * count
         barrier, mine = threading.Barrier(count, timeout=20), threading.local()
-        outcomes: list[Any] = [None] * count
 
         def process_allgather(value: Any) -> np.ndarray:
             given[mine.index] = value
@@ -33,41 +32,30 @@ def together(monkeypatch: pytest.MonkeyPatch) -> Together:
             barrier.wait()
             return values
 
-        def one(index: int) -> None:
+        def one(index: int) -> Any:
             mine.index = index
             try:
-                outcomes[index] = work(Processes(index, count))
+                return work(Processes(index, count))
             except Exception as error:
-                outcomes[index] = error
+                return error
 
         monkeypatch.setattr(processes.multihost_utils, "process_allgather", process_allgather)
-        threads = [threading.Thread(target=one, args=(k,)) for k in range(count)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        return outcomes
+        with ThreadPoolExecutor(count) as pool:
+            return list(pool.map(one, range(count)))
 
     return together
 
 
 def test_all_get_what_all_give_in_order(together: Together) -> None:
-    """Short and long values, of other lengths each."""
+    """Short and long values, of other lengths each; a flag of one is everyone's."""
 
     def work(us: Processes) -> Any:
         rounds = [us.gather({"i": us.index, "text": "é" * us.index * 20 * k}) for k in range(5)]
-        return us.first, rounds
+        return us.first, rounds, [us.any(us.index == k) for k in range(4)]
 
     rounds = [[{"i": i, "text": "é" * i * 20 * k} for i in range(3)] for k in range(5)]
-    assert together(3, work) == [(i == 0, rounds) for i in range(3)]
-
-
-def test_one_flag_is_everyones(together: Together) -> None:
-    def work(us: Processes) -> Any:
-        return [us.any(us.index == k) for k in range(4)], us.any(False)
-
-    # Nobody has the number 3.
-    assert together(3, work) == [([True, True, True, False], False)] * 3
+    flags = [True, True, True, False]  # nobody has the number 3
+    assert together(3, work) == [(i == 0, rounds, flags) for i in range(3)]
 
 
 def test_the_first_acts_for_all(together: Together) -> None:
@@ -125,7 +113,7 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatc
     """Those that may use the same ones; whoever was bound already stays where it is."""
     bound: list[Sequence[int]] = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append(cores))
-    monkeypatch.setattr(cluster, "_let_threads_finish", lambda: None)
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)
 
     def share(*everyone: tuple[str, list[int]]) -> tuple[list[Sequence[int]], set[int]]:
         bound.clear()
@@ -138,7 +126,7 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatc
     assert fewest == {1}
     assert share(("a", [0, 1]), ("a", [2, 3, 4])) == ([[0, 1], [2, 3, 4]], {2})
     assert share(("a", [0, 1]), ("b", [0, 1])) == ([[0, 1], [0, 1]], {2})
-    assert share(("a", [4]), ("a", [4])) == ([[4], [4]], {1}), "too few to share"
+    assert share(*[("a", [4, 5])] * 3) == ([[4, 5]] * 3, {2}), "too few to share"
 
 
 @pytest.fixture
@@ -161,7 +149,7 @@ def no_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
         (("localhost:1", 0, 0), "num_processes is 0; it must be at least 1"),
     ],
 )
-def test_a_place_that_is_none_is_refused(flags: tuple[Any, Any, Any], sentence: str) -> None:
+def test_an_impossible_place_is_refused(flags: tuple[Any, Any, Any], sentence: str) -> None:
     with pytest.raises(ProcessError, match=sentence):
         find_cluster(*flags)
 
@@ -171,21 +159,28 @@ def test_addresses_of_both_kinds_are_read() -> None:
     assert resolve("[::1]:5602") == ("::1", 5602)
 
 
+SLURM = (
+    "SLURM_JOB_ID=4242 SLURM_STEP_NODELIST=node[07-09] SLURM_NTASKS=3 SLURM_PROCID=2 "
+    "SLURM_LOCALID=0"
+)
+OPEN_MPI = (
+    "OMPI_MCA_orte_hnp_uri=1531576320.0;tcp://10.96.0.1,10.148.0.1:34911 OMPI_COMM_WORLD_SIZE=4 "
+    "OMPI_COMM_WORLD_RANK=3 OMPI_COMM_WORLD_LOCAL_RANK=1"
+)
+
+
 @pytest.mark.usefixtures("no_cluster")
-def test_jax_finds_slurm_and_open_mpi(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "resolve", lambda address: None)
-    slurm = {"JOB_ID": 4242, "STEP_NODELIST": "node[07-09]", "NTASKS": 3, "PROCID": 2, "LOCALID": 0}
-    for name, value in slurm.items():
-        monkeypatch.setenv(f"SLURM_{name}", str(value))
-    address, *place = find_cluster(None, None, None)
-    assert place == [3, 2, [0]]
-    assert str(address).startswith("node07:")
+@pytest.mark.parametrize(
+    ("variables", "host", "place"),
+    [(SLURM, "node07:", [3, 2, [0]]), (OPEN_MPI, "10.96.0.1:", [4, 3, [1]])],
+)
+def test_jax_finds_slurm_and_open_mpi(
+    variables: str, host: str, place: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "resolve", lambda address: None)
+    for variable in variables.split():
+        monkeypatch.setenv(*variable.split("=", 1))
+    address, *found = find_cluster(None, None, None)
+    assert found == place
+    assert address.startswith(host)
     assert find_cluster("other:5", None, None).coordinator_address == "other:5"
-    for name in slurm:
-        monkeypatch.delenv(f"SLURM_{name}")
-    monkeypatch.setenv("OMPI_MCA_orte_hnp_uri", "1531576320.0;tcp://10.96.0.1,10.148.0.1:34911")
-    for name, value in (("SIZE", 4), ("RANK", 3), ("LOCAL_RANK", 1)):
-        monkeypatch.setenv(f"OMPI_COMM_WORLD_{name}", str(value))
-    address, *place = find_cluster(None, None, None)
-    assert place == [4, 3, [1]]
-    assert str(address).startswith("10.96.0.1:")

@@ -12,14 +12,10 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from mjx_balance.config import Config, flatten, preset, to_dict
+from mjx_balance.config import Config, preset
 from mjx_balance.files.sources import code
 from mjx_balance.training import program_cache, sizing
-from mjx_balance.training.program_cache import (
-    NOT_TRACED,
-    compile_program,
-    program_key,
-)
+from mjx_balance.training.program_cache import NOT_TRACED, compile_program, program_key
 
 ROOT = sizing.__name__
 CONFIG = preset("smoke")
@@ -63,7 +59,12 @@ def check_run(program: Callable[[Any], tuple[Any, Any]]) -> None:
     assert float(output["sum"]) == 3
 
 
-def test_a_second_start_traces_nothing(cache: Path) -> None:
+def test_a_second_start_traces_nothing_but_programs_without_a_key(cache: Path) -> None:
+    """As one that calls what another process would not know."""
+    for counter in (Counter(), Counter()):
+        check_run(compile_program(counter.program, start(), None, pytest.fail))
+        assert counter.traced == 1
+    assert not (cache / "programs").exists()
     first, second = Counter(), Counter()
     check_run(compile_program(first.program, start(), "key", pytest.fail))
     assert first.traced == 1
@@ -75,14 +76,6 @@ def test_a_second_start_traces_nothing(cache: Path) -> None:
     assert second.traced == 1
 
 
-def test_a_program_without_a_key_is_traced_every_time(cache: Path) -> None:
-    """As one that calls what another process would not know."""
-    for counter in (Counter(), Counter()):
-        check_run(compile_program(counter.program, start(), None, pytest.fail))
-        assert counter.traced == 1
-    assert not (cache / "programs").exists()
-
-
 @pytest.mark.parametrize(
     "damage",
     [
@@ -92,29 +85,29 @@ def test_a_program_without_a_key_is_traced_every_time(cache: Path) -> None:
         lambda content: b"x" * 40,
     ],
 )
-def test_a_damaged_program_is_said_and_replaced(
+def test_a_damaged_program_is_logged_and_replaced(
     cache: Path, damage: Callable[[bytes], bytes]
 ) -> None:
     compile_program(Counter().program, start(), "key", pytest.fail)
     file = cache / "programs" / "key.stablehlo"
     whole = file.read_bytes()
     file.write_bytes(damage(whole))
-    said: list[str] = []
+    lines: list[str] = []
     again = Counter()
-    check_run(compile_program(again.program, start(), "key", said.append))
+    check_run(compile_program(again.program, start(), "key", lines.append))
     assert again.traced == 1
-    assert said == [f"the cached program {file} is made anew: it is damaged"]
+    assert lines == [f"the cached program {file} is made anew: it is damaged"]
     compile_program(again.program, start(), "key", pytest.fail)
     assert again.traced == 1
 
 
-def test_a_cache_that_cannot_be_written_is_said_and_done_without(cache: Path) -> None:
+def test_a_run_works_without_a_cache_that_it_cannot_write(cache: Path) -> None:
     cache.write_text("no folder")
-    said: list[str] = []
-    check_run(compile_program(Counter().program, start(), "key", said.append))
-    program_cache.enable_compilation_cache(said.append)
-    assert len(said) == 3  # neither read nor written, nor what XLA keeps
-    for line in said[1:]:
+    lines: list[str] = []
+    check_run(compile_program(Counter().program, start(), "key", lines.append))
+    program_cache.enable_compilation_cache(lines.append)
+    assert len(lines) == 3  # neither read nor written, nor XLA's own
+    for line in lines[1:]:
         assert "cannot be written: Not a directory" in line
     assert cache.read_text() == "no folder"
 
@@ -134,12 +127,12 @@ def xla_cache(cache: Path) -> Iterator[Path]:
     compilation_cache.reset_cache()
 
 
-def test_what_xla_finds_damaged_is_said_and_taken_away(xla_cache: Path) -> None:
+def test_what_xla_finds_damaged_is_logged_and_removed(xla_cache: Path) -> None:
     def start() -> list[str]:
-        said: list[str] = []
-        with program_cache.mending_xla_cache(said.append):
+        lines: list[str] = []
+        with program_cache.mending_xla_cache(lines.append):
             assert jax.jit(lambda x: 2 * x + 1)(3) == 7
-        return said
+        return lines
 
     def entries() -> list[Path]:
         return sorted(xla_cache.glob("jit__lambda*-cache"))
@@ -163,41 +156,39 @@ def test_other_warnings_are_passed_on() -> None:
         warnings.warn("mind the gap", stacklevel=1)
 
 
+@pytest.fixture
+def same_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Code counts as the same, which is faster than to read it."""
+    monkeypatch.setattr(program_cache, "code", lambda root: {})
+
+
 def key(config: Config = CONFIG, iterations: int = 16) -> str:
     return program_key(config, iterations, ROOT)
 
 
-def test_the_same_run_has_the_same_key_and_another_seed_too() -> None:
+@pytest.mark.usefixtures("same_code")
+def test_the_key_depends_on_every_number_that_is_traced() -> None:
     assert key() == key()
     others = {"seed": 5, "preset": "best", "log_every": 7, "checkpoint_seconds": 1.0}
-    others |= {"eval_scenarios": 3, "eval_duration": 1.0}
-    others |= {"eval_every": 0, "validation_scenarios": 3, "validation_duration": 1.0}
-    others |= {"export": "best"}
+    others |= {"eval_scenarios": 3, "eval_duration": 1.0, "eval_every": 0, "export": "best"}
+    others |= {"validation_scenarios": 3, "validation_duration": 1.0}
     assert set(others) == set(NOT_TRACED)
     assert key(dataclasses.replace(CONFIG, **others)) == key()
-
-
-def test_every_other_number_changes_the_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program_cache, "code", lambda root: {})  # the same for all
-    keys = {key(), key(iterations=17)}
-    values = to_dict(CONFIG)
-    places = [((name,), value) for name, value in values.items() if not isinstance(value, dict)]
-    for section, fields in values.items():
-        if isinstance(fields, dict):
-            places += [((section, name), value) for name, value in flatten(fields).items()]
-    count = 2
-    for (*section, name), value in places:
-        if name in NOT_TRACED:
-            continue
-        change: dict[str, Any] = {name: "go1" if name == "robot" else f"{value} and more"}
-        if section:
-            inner = dataclasses.replace(getattr(CONFIG, section[0]), **change)
-            change = {section[0]: inner}
-        keys.add(key(dataclasses.replace(CONFIG, **change)))
-        count += 1
+    keys, count = {key(), key(iterations=17)}, 2
+    for name in ("", "task", "randomization", "dqn"):
+        section = getattr(CONFIG, name) if name else CONFIG
+        for field in dataclasses.fields(section):
+            value = getattr(section, field.name)
+            if field.name in NOT_TRACED or dataclasses.is_dataclass(value):
+                continue
+            other = "go1" if field.name == "robot" else f"{value} and more"
+            changed = dataclasses.replace(section, **{field.name: other})
+            keys.add(key(dataclasses.replace(CONFIG, **{name: changed}) if name else changed))
+            count += 1
     assert len(keys) == count > 60
 
 
+@pytest.mark.usefixtures("same_code")
 def test_another_model_of_a_robot_changes_the_key(tmp_path: Path, bodies: Any) -> None:
     """Its file and its name are the same."""
     spec = bodies.our_spec()
@@ -211,6 +202,7 @@ def test_another_model_of_a_robot_changes_the_key(tmp_path: Path, bodies: Any) -
     assert len(keys) == 2
 
 
+@pytest.mark.usefixtures("same_code")
 @pytest.mark.parametrize(
     ("flag", "value"),
     [
@@ -230,6 +222,7 @@ def test_settings_of_jax_change_the_key(flag: str, value: object) -> None:
     assert key() == before
 
 
+@pytest.mark.usefixtures("same_code")
 def test_a_library_and_a_device_change_the_key(monkeypatch: pytest.MonkeyPatch) -> None:
     before = key()
     for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "mjx_balance"):

@@ -1,12 +1,9 @@
 """First episodes end at different times, later ones have their whole length."""
 
-import dataclasses
 from typing import Any
 
 import jax
 import numpy as np
-
-from mjx_balance.training.sizing import make_learner, size_to_device
 
 ENVS, EPISODE = 32, 50
 
@@ -26,8 +23,3 @@ def test_first_episodes_are_of_every_length(fleet: Any) -> None:
 def test_a_later_episode_has_its_whole_length(fleet: Any) -> None:
     left = fleet.reset(jax.random.split(jax.random.PRNGKey(1), ENVS)).info["episode_length"]
     assert (np.asarray(left) == EPISODE).all()
-
-
-def test_a_run_begins_with_staggered_episodes(fleet: Any) -> None:
-    sized = size_to_device(dataclasses.replace(fleet.env.config, num_envs=ENVS))
-    assert make_learner(sized, fleet.env).spec.first_reset == fleet.env.reset_staggered
