@@ -184,7 +184,7 @@ def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
     """Compares a run's saved provenance with today's.
 
     Args:
-      path: the run folder.
+      path: of the run.
       today: `versions` {library: version}, and by name all else that determines the run.
 
     Returns:

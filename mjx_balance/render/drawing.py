@@ -74,11 +74,7 @@ class Painter:
     """Draws states one by one in a child process, which runs until `close`."""
 
     def __init__(self, config: Config, size: tuple[int, int] = VIDEO_SIZE):
-        """Starts the process.
-
-        Args:
-          config: defines the scene.
-          size: width and height of the pictures.
+        """Starts the process, for pictures of the config's scene; `size` is (width, height).
 
         Raises:
           RenderError: if no OpenGL backend works here.
@@ -137,11 +133,7 @@ class Window:
     """MuJoCo's viewer; plays states at real speed."""
 
     def __init__(self, config: Config, on_key: Callable[[int], None] | None = None):
-        """Opens the window.
-
-        Args:
-          config: defines the scene.
-          on_key: called with the GLFW code of every key that the user presses.
+        """Opens the window; `on_key` is called with the GLFW code of every key that is pressed.
 
         Raises:
           RenderError: if there is no display, or macOS needs `mjpython`.

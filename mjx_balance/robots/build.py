@@ -23,7 +23,6 @@ FRESH = mujoco.MjSpec()
 """MuJoCo's defaults, which its maker's model may have changed."""
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
-IMU = "balance_imu"
 BOARD_SIZE = "board_size"
 """Name of the model's numeric element with `RobotFile.board_size`."""
 REMOVED = (
@@ -468,4 +467,4 @@ def _imu(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file
         if np.allclose(site.quat, (1, 0, 0, 0)):
             return site.name
         place = site.pos
-    return trunk.add_site(FRESH.default, name=_free_name(spec.sites, IMU), pos=place).name
+    return trunk.add_site(FRESH.default, name=_free_name(spec.sites, "balance_imu"), pos=place).name

@@ -64,7 +64,7 @@ class Leg:
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """Geometry and mass, measured on the compiled model."""
+    """Geometry (m) and mass (kg), measured on the compiled model."""
 
     __pydantic_config__ = STRICT
 
@@ -75,11 +75,8 @@ class Body:
     trunk: str
     """Name of the body to keep level; it has a free joint."""
     foot_radius: Number
-    """m"""
     trunk_mass: Number
-    """kg"""
     total_mass: Number
-    """kg"""
 
     @property
     def left(self) -> tuple[bool, ...]:

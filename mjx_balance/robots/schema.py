@@ -94,9 +94,8 @@ class RobotFile:
     board_size: Positive | None = None
     """Length of the board in training, m."""
     source: str = ""
-    """Source of the model."""
     license: str = ""
-    """License of the model."""
+    """Of the model, like `source`."""
 
 
 REMEDIES = {
@@ -132,7 +131,7 @@ def parse_robot_file(text: str, path: Path) -> RobotFile:
 
     Args:
       text: TOML.
-      path: gives the robot's name and folder; need not exist.
+      path: gives name and folder; need not exist.
 
     Raises:
       RobotError: names the first invalid field, its value and what would be right.
