@@ -19,10 +19,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command.
-
-    Args:
-      arguments: of the command line, without the program's name; those of `sys.argv` if None.
+    """Runs a command with these arguments, or those of `sys.argv`.
 
     Returns:
       The exit code: 0, 1 for failures, 2 for invalid input, 130 after Ctrl-C.
@@ -45,7 +42,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return complain(f"cannot write {error.filename or 'all of it'}: {error.strerror}")
     except KeyboardInterrupt:
         return INTERRUPTED
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -55,9 +55,7 @@ class ControllerArgs:
         """Loads the policy or builds the baseline, and its scene.
 
         Raises:
-          ControllerError: if both or neither of policy and baseline are given.
-          PolicyError: if the policy cannot be used.
-          ConfigError: if the robot does not exist.
+          InputError: if both or neither are given, or the policy or robot cannot be used.
         """
         if (self.policy is None) == (self.controller is None):
             raise ControllerError("name a policy file or --controller NAME, one of the two")

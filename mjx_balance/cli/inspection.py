@@ -33,11 +33,7 @@ class TiltTest(NamedTuple):
 
 
 def inspect(robot: str) -> tuple[Scene, TiltTest]:
-    """Builds the scene of `config.robot` and runs the tilt test.
-
-    Raises:
-      ConfigError: if the robot cannot be built or does not stand.
-    """
+    """Builds a robot's scene and runs the tilt test; raises `ConfigError` if it does not stand."""
     scene = load_scene(check(for_robot(preset("default"), robot)))
     return scene, tilt_board(scene)
 

@@ -63,14 +63,9 @@ class Session:
     def __init__(
         self, scene: Scene, controller: Controller, suite: str | None = None, seed: int = 0
     ):
-        """Stands the robot on the level board.
+        """Stands the robot on the level board, which keys move if there is no suite.
 
-        Args:
-          scene: model, stance and task.
-          controller: chooses the actions.
-          suite: its scenarios move the board and push the robot; if None, only keys do.
-          seed: of the first scenario, and of the directions of pushes by key; each later scenario
-            adds 1.
+        `seed` draws pushes by key and the first scenario of the suite; each later one adds 1.
 
         Raises:
           SuiteError: if the suite does not exist, or the seed is negative.

@@ -87,12 +87,12 @@ def roll_out(
     record: bool = False,
     progress: Progress = lambda share: None,
 ) -> Rollout:
-    """Runs a controller in plain MuJoCo on n episodes.
+    """Runs a controller in plain MuJoCo.
 
     Args:
       scene: task, model and stance.
-      controller: chooses action indices or height changes.
-      episodes: n of them.
+      controller: chooses the actions.
+      episodes: of each scenario.
       duration: s, rounded up to whole decisions.
       record: whether to record every qpos.
       progress: called with the share done.
@@ -185,11 +185,7 @@ def settled_action(rollout: Rollout) -> float | None:
 
 
 def policy_scene(policy: Policy, robot: str | None = None) -> Scene:
-    """Builds the scene a policy was trained in.
-
-    Args:
-      policy: names robot and scene.
-      robot: name of its robot here; None: as in training.
+    """Builds the scene a policy was trained in; `robot` is the name of its robot here.
 
     Raises:
       PolicyError: if the robot is not here, is another one, or today's scene files or engine
@@ -237,11 +233,8 @@ def evaluate(
 def check_fits(task: TaskConfig, scenarios: int, duration: float, recorded: int = 0) -> None:
     """Refuses an evaluation of nothing, or of more than the memory holds.
 
-    Args:
-      task: gives the physics step.
-      scenarios: number of scenarios.
-      duration: of each, s.
-      recorded: values recorded per physics step, besides the tilt.
+    Its scenarios last `duration` s; `recorded` values are stored per physics step, besides the
+    tilt.
 
     Raises:
       EvaluationError: with the estimate.

@@ -77,13 +77,6 @@ class Seeds:
 SEEDS = Seeds()
 
 
-def find_suite(name: str) -> Suite:
-    """Returns the suite called `name`; raises `SuiteError` with the known names."""
-    if name not in SUITES:
-        raise SuiteError(f"unknown suite {name!r}; known suites: {', '.join(SUITES)}")
-    return SUITES[name]
-
-
 def check_seed(seed: int) -> None:
     """Raises `SuiteError` for a seed that nothing can be drawn by."""
     if seed < 0:
@@ -91,24 +84,19 @@ def check_seed(seed: int) -> None:
 
 
 def draw_suite(config: Config, suite: str, scenarios: int, duration: float, seed: int) -> Episodes:
-    """Draws a suite's episodes.
+    """Draws a suite's episodes, each of `duration` s.
 
     Scenario k of a seed is the same however many are drawn. Scenario, sensor noise and pushes come
     from generators of their own, told apart by their last number.
-
-    Args:
-      config: robot and task.
-      suite: its name.
-      scenarios: number of scenarios.
-      duration: of each, s.
-      seed: not negative.
 
     Raises:
       SuiteError: for an unknown suite, a negative seed, or a board that does not arrive
         before its next target.
     """
-    chosen, task, robot = find_suite(suite), config.task, find_robot(config.robot)
+    if suite not in SUITES:
+        raise SuiteError(f"unknown suite {suite!r}; known suites: {', '.join(SUITES)}")
     check_seed(seed)
+    chosen, task, robot = SUITES[suite], config.task, find_robot(config.robot)
     count = tilt.num_targets(task, duration)
     rngs = [np.random.default_rng((seed, k)) for k in range(scenarios)]
     uniform = np.asarray([rng.uniform(size=(count, 2)) for rng in rngs])

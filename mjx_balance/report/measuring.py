@@ -130,14 +130,9 @@ def _measure(
 def record_rollout(
     policy: Policy, suite: str, duration: float, seed: int, controller: str = "policy"
 ) -> Rollout:
-    """Runs one scenario and records every state, for a figure or a video.
+    """Runs one scenario of `duration` s and records every state, for a figure or a video.
 
-    Args:
-      policy: defines config and scene.
-      suite: kind of scenario.
-      duration: of the scenario, s.
-      seed: of the scenario.
-      controller: `policy`, or the name of a baseline to run instead.
+    The controller is `policy`, or the name of a baseline to run in its place.
 
     Raises:
       PolicyError: if the policy belongs to another scene.

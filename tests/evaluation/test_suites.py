@@ -13,7 +13,6 @@ from mjx_balance.evaluation.suites import (
     SUITES,
     SuiteError,
     draw_suite,
-    find_suite,
 )
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
@@ -133,7 +132,7 @@ def test_impossible_wishes_are_refused(config: Config) -> None:
         draw_suite(config, "paper", 1, 10, -1)
     names = "paper, corner, noise, payload, friction, gains, latency, push, fast, steep"
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
-        find_suite("moon")
+        draw_suite(config, "moon", 1, 10, 0)
 
 
 def test_no_seed_serves_two_purposes() -> None:

@@ -355,18 +355,3 @@ def test_a_flood_is_refused_soon_and_in_little_memory(
         tracemalloc.stop()
         # One line of the metrics at a time, 1/4 MiB of it at most.
         assert peak < (12 if name == "metrics.jsonl" else 150) * 2**20
-
-
-@pytest.mark.slow
-def test_a_flood_that_is_a_run_is_read_soon_and_in_little_memory(
-    tmp_path: Path, metrics_line: Any
-) -> None:
-    lines = (json.dumps(metrics_line(k, 5)) for k in range(12_000))
-    (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
-    rows = ",".join(["{}"] * 700_000)
-    (tmp_path / "seeds.json").write_text(f'{{"seeds": [{rows}]}}')
-    began = time.process_time()
-    run = reading.read_run(tmp_path)
-    assert time.process_time() - began < 1
-    assert len(run.metrics) > 8_000
-    assert "its first 8 MiB are shown" in "".join(run.missing)
