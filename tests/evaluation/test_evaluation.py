@@ -61,7 +61,7 @@ def held_boards(config: Config, targets: Any, duration: float) -> Scenario:
 
 
 def nominal(count: int) -> DomainParams:
-    """Circumstances that change nothing."""
+    """Parameters that change nothing."""
     return DomainParams(
         imu_noise=np.zeros((count, 6)),
         payload=np.zeros(count),
@@ -88,8 +88,8 @@ class ByHand:
 
     LEGS = ("LF", "RF", "LH", "RH")
 
-    def __init__(self, scene: Scene, gain: float, load: float, up: float, late: bool):
-        self.model, self.late, self.scene = copy.copy(scene.model), late, scene
+    def __init__(self, scene: Scene, gain: float, load: float, up: float, delayed: bool):
+        self.model, self.delayed, self.scene = copy.copy(scene.model), delayed, scene
         for leg in self.LEGS:
             for joint in ("abduction", "hip", "knee"):
                 servo = self.model.actuator(f"robot/{leg}_{joint}")
@@ -103,7 +103,7 @@ class ByHand:
         self.data = mujoco.MjData(self.model)
         self.data.qpos[:], self.data.qvel[:] = scene.stance.qpos, scene.stance.qvel
         self.data.qacc_warmstart[:] = scene.stance.qacc_warmstart
-        self.told, self.stands = [np.full(4, 0.35)], np.full(4, 0.35)
+        self.commands, self.stands = [np.full(4, 0.35)], np.full(4, 0.35)
         self.imu, self.board = [scene.stance.imu] * 200, np.zeros(2)
         self.qpos: list[np.ndarray] = []
 
@@ -119,8 +119,8 @@ class ByHand:
                 foot = self.data.site(f"robot/{of}_foot").xpos - self.data.body("robot/trunk").xpos
                 values.append((-(frame.T @ foot)[2] + 0.022 - 0.35) / 0.01)
             elif symbol == "C":
-                told = ([np.full(4, 0.35)] * 9 + self.told)[-1 - lag]
-                values.append((told[self.LEGS.index(of)] - 0.35) / 0.01)
+                command = ([np.full(4, 0.35)] * 9 + self.commands)[-1 - lag]
+                values.append((command[self.LEGS.index(of)] - 0.35) / 0.01)
             else:
                 channel = "xyz".index(of) + (0 if symbol == "V" else 3)
                 last = len(self.imu) - lag
@@ -131,9 +131,9 @@ class ByHand:
     def decide(self, action: int, target: np.ndarray, rate: float) -> None:
         """Takes action n_x * 21 + n_y of -3 + 0.3 n mm, and lets 0.2 s pass."""
         a_x, a_y = (-0.003 + 0.0003 * n for n in divmod(action, 21))
-        wanted = self.told[-1] + (a_x + a_y, a_y - a_x, a_x - a_y, -a_x - a_y)
-        goal = self.told[-1] if self.late else wanted
-        self.told.append(wanted)
+        command = self.commands[-1] + (a_x + a_y, a_y - a_x, a_x - a_y, -a_x - a_y)
+        goal = self.commands[-1] if self.delayed else command
+        self.commands.append(command)
         for k in range(1, 51):
             self.board = self.board + np.clip(target - self.board, -rate * 0.004, rate * 0.004)
             heights = self.stands + (goal - self.stands) * min(k / 5, 1)
@@ -156,9 +156,9 @@ class ByHand:
 def test_rollout_is_what_a_loop_of_single_steps_gives(
     config: Config, scene: Scene, rich: bool
 ) -> None:
-    """Two worlds of 1.2 s: every state, observation, IMU sample, tilt and action.
+    """Two scenarios of 1.2 s: every state, observation, IMU sample, tilt and action.
 
-    The second has weak servos, a load and late actions; `rich` sees commands and means.
+    The second has weak servos, a load and delayed actions; `rich` sees commands and means.
     """
     lags = {"command_lags": (0, 2), "imu_mean": 4, "gyro_lags": (0, 20), "accel_lags": (3, 60)}
     task = dataclasses.replace(config.task, **(lags if rich else {}))  # pyright: ignore[reportArgumentType]
@@ -171,21 +171,21 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
         gain=np.asarray((1.0, 0.85)),
         delay=np.asarray((0.0, 1.0)),
     )
-    worlds = [ByHand(scene, 1.0, 0.0, 0.0, False), ByHand(scene, 0.85, 3.0, 0.1, True)]
+    singles = [ByHand(scene, 1.0, 0.0, 0.0, False), ByHand(scene, 0.85, 3.0, 0.1, True)]
     actions = np.random.default_rng(1).integers(0, 441, (6, 2))
 
     def act(view: View) -> np.ndarray:
         assert view.delayed.tolist() == [False, True]
-        for k, world in enumerate(worlds):
-            np.testing.assert_allclose(view.obs[k], world.observation(scene.config), atol=1e-6)
-            np.testing.assert_allclose(view.imu[k], world.imu[-50:], atol=1e-7)
-            np.testing.assert_allclose(view.qpos[k], world.data.qpos, atol=1e-9)
-            np.testing.assert_allclose(view.qvel[k], world.data.qvel, atol=1e-8)
-            world.decide(actions[view.env_steps, k], targets[k, 0], (3.5, 2.0)[k])
+        for k, single in enumerate(singles):
+            np.testing.assert_allclose(view.obs[k], single.observation(scene.config), atol=1e-6)
+            np.testing.assert_allclose(view.imu[k], single.imu[-50:], atol=1e-7)
+            np.testing.assert_allclose(view.qpos[k], single.data.qpos, atol=1e-9)
+            np.testing.assert_allclose(view.qvel[k], single.data.qvel, atol=1e-8)
+            single.decide(actions[view.env_steps, k], targets[k, 0], (3.5, 2.0)[k])
         return actions[view.env_steps]
 
     rollout = roll_out(scene, act, Episodes(scenarios, conditions), 1.2, record=True)
-    expected = np.asarray([world.qpos for world in worlds])
+    expected = np.asarray([single.qpos for single in singles])
     np.testing.assert_allclose(np.asarray(rollout.qpos), expected, atol=1e-9)
     np.testing.assert_allclose(rollout.tilt, [tilts(scene, x) for x in expected], atol=1e-5)
     assert 1 < rollout.tilt.max() < 6
@@ -201,23 +201,23 @@ def test_pushes_come_between_a_choice_and_its_decision(config: Config, scene: Sc
     targets = np.asarray([[(4.0, -2.0)], [(-3.0, 1.0)]])
     scenarios = Scenario(targets, np.zeros(2), np.full(2, 3.5))
     velocity = np.asarray([[(0.3, -0.1), (0.0, 0.2)], [(-0.2, 0.25), (0.1, 0.1)]])
-    worlds = [ByHand(scene, 1.0, 0.0, 0.0, False) for _ in range(2)]
+    singles = [ByHand(scene, 1.0, 0.0, 0.0, False) for _ in range(2)]
     free = scene.model.jnt_dofadr[scene.model.joint("robot/root").id]
     actions = np.random.default_rng(1).integers(0, 441, (6, 2))
 
     def act(view: View) -> np.ndarray:
-        for k, world in enumerate(worlds):
-            np.testing.assert_allclose(view.obs[k], world.observation(config), atol=1e-6)
-            np.testing.assert_allclose(view.qvel[k], world.data.qvel, atol=1e-8)
+        for k, single in enumerate(singles):
+            np.testing.assert_allclose(view.obs[k], single.observation(config), atol=1e-6)
+            np.testing.assert_allclose(view.qvel[k], single.data.qvel, atol=1e-8)
             if view.env_steps in (1, 4):
-                world.data.qvel[free : free + 2] += velocity[k, (1, 4).index(view.env_steps)]
-            world.decide(actions[view.env_steps, k], targets[k, 0], 3.5)
+                single.data.qvel[free : free + 2] += velocity[k, (1, 4).index(view.env_steps)]
+            single.decide(actions[view.env_steps, k], targets[k, 0], 3.5)
         return actions[view.env_steps]
 
     pushes = Pushes(velocity, np.asarray([(1, 4), (1, 4)]))
     rollout = roll_out(scene, act, Episodes(scenarios, pushes=pushes), 1.2, record=True)
     assert not rollout.fell.any()
-    np.testing.assert_allclose(np.asarray(rollout.qpos), [x.qpos for x in worlds], atol=1e-9)
+    np.testing.assert_allclose(np.asarray(rollout.qpos), [x.qpos for x in singles], atol=1e-9)
 
 
 def test_who_stands_gets_its_own_push_when_others_have_fallen(config: Config, scene: Scene) -> None:
@@ -397,7 +397,7 @@ def test_share_of_the_feasible_cells_without_a_fall() -> None:
 def test_cells_of_the_envelope_are_inclines_by_speeds(
     config: Config, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A made-up world where a board falls beyond 8 deg or 5 deg/s, tilted by both."""
+    """A made-up simulation in which a robot falls beyond 8 deg or 5 deg/s, tilted by both."""
     asked = []
 
     def roll(scene: Scene, controller: Any, episodes: Episodes, *_: Any, **__: Any):
