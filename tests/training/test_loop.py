@@ -133,7 +133,7 @@ def test_every_call_is_logged_and_the_end_is_saved(
     def program(state: Any) -> Any:
         """Whoever watches the file sees every line at once."""
         assert len(logged(folder)) == int(state.env_steps) // 20
-        return step(state)
+        return step(state, RAW | {"diverged": 0.1})
 
     state, seconds = go(program)
     assert float(state.weights) == 31  # ((((0*2+1)*2+1)*2+1)*2+1)*2+1
@@ -142,8 +142,9 @@ def test_every_call_is_logged_and_the_end_is_saved(
     assert checkpoints.saved_steps(folder.checkpoints) == [100]
     assert 0 < seconds < 10
     assert any("100/100 decisions" in line for line in display.lines)
+    assert any("diverged envs 2" in line for line in display.lines)
     last = {name: value for name, value in logged(folder)[-1].items() if "/" in name}
-    assert len(last) == 7
+    assert len(last) == 8
     assert "seeds" not in logged(folder)[-1], "there is one"
     for name, value in last.items():
         assert drawn(folder, name)[100] == pytest.approx(value, rel=1e-6)
@@ -185,11 +186,6 @@ def test_several_seeds_are_averaged_and_listed() -> None:
     assert "train/reward" not in metrics
     assert seeds.pop("falls_per_minute") == pytest.approx([6.0, 18.0])
     assert seeds == {"tilt_deg": [0.5, 1.5], "loss": [None, 4.0]}
-
-
-def test_diverged_envs_are_shown(display: Any, go: Any) -> None:
-    go(lambda state: step(state, RAW | {"diverged": 0.1}))
-    assert any("diverged envs 2" in line for line in display.lines)
 
 
 @pytest.mark.parametrize(
