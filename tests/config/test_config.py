@@ -226,7 +226,6 @@ def test_every_number_has_its_bounds_tested() -> None:
         ({"target_period": 3.9}, "target_period is 3.9 s, but a board ramp .* 4 s; the period"),
         ({"board_rate": 1.0}, "target_period is 10.0 s, but .* 14 s; the period"),
         ({"ctrl_dt": 0.202}, "ctrl_dt is 0.202 s; .* whole multiple of sim_dt, 0.004 s"),
-        ({"ctrl_dt": 0.001}, "ctrl_dt is 0.001 s; .* whole multiple of sim_dt, 0.004 s"),
         ({"action_levels": 20}, "action_levels is 20; it must be odd"),
         ({"gyro_lags": (0, -1)}, r"gyro_lags is \(0, -1\); each entry must be at least 0"),
         ({"gamma": 1.5}, "^gamma is 1.5; it must be at most 1$"),
@@ -240,7 +239,6 @@ def test_every_number_has_its_bounds_tested() -> None:
             {"friction_min": 0.9, "friction_max": 0.8},
             "friction_max is 0.8; it must not be less than friction_min, 0.9",
         ),
-        ({"push_min": 0.3, "push_max": 0.2}, "push_max is 0.2; .* push_min, 0.3"),
         ({"push_min": 0.3}, "push_max is 0.0; it must not be less than push_min, 0.3"),
         ({"push_max": 0.2, "push_period": 0.1}, "push_period is 0.1 s; .* ctrl_dt, 0.2 s"),
         ({"min_replay_size": 200_000}, "min_replay_size is 200000; .* replay_capacity, 131072"),
@@ -253,10 +251,6 @@ def test_impossible_config_is_refused(values: dict[str, Any], message: str) -> N
     """The message names the field, its value and what it clashes with."""
     with pytest.raises(ConfigError, match=message):
         check(changed(**values))
-
-
-def test_last_seed_may_be_the_greatest() -> None:
-    check(changed(seed=2**31 - 5, num_seeds=5))
 
 
 @pytest.mark.parametrize("value", [None, 3, "paper", PRESETS, TaskConfig()], ids=repr)
