@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 import types
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +101,7 @@ def test_everything_is_there_and_nothing_from_elsewhere(run: Path, written: Path
     assert text.count("data:image/png;base64,") == 6
     assert "data:video/mp4;base64," in text
     results = json.loads((run / "report.json").read_text())["results"]
-    for row, suites in zip(Tables(text).found[0][2:], results.values(), strict=True):
+    for row, suites in zip(tables(text)[0][2:], results.values(), strict=True):
         measured = [suites[suite] for suite in ("paper", "corner")]
         assert {result["scenarios"] for result in measured} == {2}
         shown = [f"{r['tilt_deg'][x]:.3f}" for r in measured for x in ("mean", "p95", "max")]
@@ -113,30 +112,16 @@ def test_everything_is_there_and_nothing_from_elsewhere(run: Path, written: Path
     assert "<script" not in text
 
 
-class Tables(HTMLParser):
+def elements(tag: str, text: str) -> list[str]:
+    """The outermost elements of a kind, with their tags."""
+    return re.findall(f"<(?:{tag})[ >].*?</(?:{tag})>", text, re.DOTALL)
+
+
+def tables(text: str) -> list[list[list[str]]]:
     """The text of every cell of every table of a page: [table][row][cell]."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.found: list[list[list[str]]] = []
-        self.inside = False
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: object) -> None:
-        if tag == "table":
-            self.found.append([])
-        elif tag == "tr":
-            self.found[-1].append([])
-        elif tag in ("td", "th"):
-            self.found[-1][-1].append("")
-            self.inside = True
-
-    def handle_endtag(self, tag: str) -> None:
-        self.inside = self.inside and tag not in ("td", "th")
-
-    def handle_data(self, data: str) -> None:
-        if self.inside:
-            self.found[-1][-1][-1] += data
+    rows = [elements("tr", table) for table in elements("table", text)]
+    words = lambda cell: html.unescape(re.sub("<.*?>", "", cell))  # noqa: E731
+    return [[[*map(words, elements("td|th", row))] for row in table] for table in rows]
 
 
 BLANK = {"title": "x", "missing": [], "policy": None, "video": None, "training": {}}
@@ -176,7 +161,7 @@ def shown(policy: Policy, **more: Any) -> str:
 
 def test_the_table_of_baselines_and_the_tiles(policy: Policy) -> None:
     text = shown(policy)
-    (table,) = Tables(text).found
+    (table,) = tables(text)
     assert table[0] == ["", "sees", "suite paper", "suite corner", "moves at restmm"]
     assert table[1] == ["falls", "mean", "p95", "max"] * 2
     names = "policy none pd-imu pd-attitude rate-oracle clairvoyant"
@@ -294,9 +279,9 @@ def test_the_first_run_that_has_a_policy_is_shown(
     text = out.read_text()
     assert "<title>mjx_balance: half, run, other</title>" in text
     assert "mjx-balance train --preset default --seed 11 --num-seeds 2" in text
-    seeds = Tables(text).found[1]
+    seeds = tables(text)[1]
     assert seeds[1][:3] == ["paper", "4", "4 of 32"], "two runs of two seeds, and one of none"
-    assert ["seed", "0", "11"] in Tables(text).found[2], "the first run's config"
+    assert ["seed", "0", "11"] in tables(text)[2], "the first run's config"
 
 
 def test_the_seeds_of_alike_runs_are_put_together(
@@ -311,7 +296,7 @@ def test_the_seeds_of_alike_runs_are_put_together(
     other = run_of("c", dataclasses.replace(config, dqn=dqn), 5.0)
     unknown = run_of("d", None, 6.0)
     seeds = page.seeds_statistics(first, [other, first, more, unknown])
-    table = Tables(shown(policy, seeds=seeds)).found[1]
+    table = tables(shown(policy, seeds=seeds))[1]
     heads = "suite|seeds|falls|mean|worst seed|p95|worst seed|max|worst seed"
     assert table[0] == heads.split("|")
     three = ["0.233 (0.100-0.400)", "0.400"]
@@ -329,7 +314,7 @@ def test_the_config_table_shows_what_differs_from_the_papers() -> None:
     dqn = dataclasses.replace(preset("paper").dqn, gamma=0.77)
     config = dataclasses.replace(preset("paper"), dqn=dqn, seed=3)
     text = page.render_page(BLANK | {"config": page.config_tables(config)})
-    (table,) = Tables(text).found
+    (table,) = tables(text)
     assert table == [
         ["field", "preset paper", "this run"],
         ["seed", "0", "3"],
@@ -365,8 +350,8 @@ def test_the_commands_make_everything_again(policy: Policy, config: Config) -> N
 )
 def test_the_reward_is_said_to_be_taken_where_it_is(config: Config, where: str, words: str) -> None:
     task = dataclasses.replace(config.task, reward_tilt=where)
-    tables = page.config_tables(dataclasses.replace(config, task=task))
-    text = page.render_page(BLANK | {"config": tables, "training": {"reward": "AAAA"}})
+    values = page.config_tables(dataclasses.replace(config, task=task))
+    text = page.render_page(BLANK | {"config": values, "training": {"reward": "AAAA"}})
     assert f"the tilt is taken {words}</p>" in text
 
 
