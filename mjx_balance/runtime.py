@@ -497,10 +497,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 def _array(name: str, entry: dict[str, Any], numbers: memoryview) -> np.ndarray:
     if entry["dtype"] != "F32":
-        raise PolicyFileError(f"weight {name} is {entry['dtype']}; it must be F32 (float32)")
+        kind = f"{entry['dtype']!s:.40}"
+        raise PolicyFileError(f"weight {name!r:.80} is {kind}; it must be F32 (float32)")
     begin, end = entry["data_offsets"]
     if not 0 <= begin <= end <= len(numbers):
-        raise ValueError(f"weight {name} lies outside the file")
+        raise ValueError(f"weight {name!r:.80} lies outside the file")
     return np.frombuffer(numbers[begin:end], "<f4").astype(np.float32).reshape(entry["shape"])
 
 

@@ -19,11 +19,10 @@ class QNetwork(nn.Module):
     https://arxiv.org/abs/2010.14680, section 3, hyperedges of rank one).
 
     With `radial`, the levels are points from -1 to 1 on one axis per factor, and the network
-    outputs the best point mu and its value V (`heads.Radial`). The idea is that of normalized
-    advantage functions (Gu et al. 2016, https://arxiv.org/abs/1603.00748, section 4): the value
-    falls off around a best action, here on a grid and with a learned profile instead of a parabola.
-    A skip connection from the observation to mu and V makes linear control laws easy. The profile
-    and the scales of the axes are parameters that do not depend on the state.
+    outputs the best point mu and its value V (`heads.Radial`), as in normalized advantage functions
+    (Gu et al. 2016, https://arxiv.org/abs/1603.00748, section 4), but on a grid and with a learned
+    profile instead of a parabola. A skip connection from the observation to mu and V makes linear
+    control laws easy. Profile and scales of the axes do not depend on the state.
     """
 
     hidden_sizes: Sequence[int]

@@ -21,9 +21,12 @@ MOST_MANIFEST = 4 * 2**20
 
 
 def flat_weights(params: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Flattens a flax network's variables to {name: float32 array}, e.g. `hidden_0/kernel`."""
+    """Flattens a flax network's variables to {name: float32 array}, e.g. `hidden_0/kernel`.
+
+    Arrays by name stay as they are.
+    """
     weights = {}
-    for layer, value in params["params"].items():
+    for layer, value in params.get("params", params).items():
         arrays = value.items() if isinstance(value, Mapping) else [("", value)]
         for name, array in arrays:
             key = f"{layer}/{name}" if name else layer
@@ -38,25 +41,17 @@ def save_policy(
 
     Args:
       path: file to write.
-      params: the flax network's variables, {"params": {layer: {kernel, bias}, name: array}}.
+      params: the flax network's variables, {"params": {layer: {kernel, bias}, name: array}}, or
+        arrays by name.
       manifest: from `make_manifest`.
-
-    Returns:
-      The policy.
 
     Raises:
       PolicyError: if weights and manifest do not match.
       OSError: if the file cannot be written.
     """
-    return write_policy(path, flat_weights(params), manifest)
-
-
-def write_policy(
-    path: str | os.PathLike[str], weights: Mapping[str, np.ndarray], manifest: dict[str, Any]
-) -> Policy:
-    """As `save_policy`, for weights from `flat_weights`."""
+    weights = flat_weights(params)
     policy = Policy(manifest, weights)
-    content = safetensors.numpy.save(dict(weights), metadata={"manifest": json.dumps(manifest)})
+    content = safetensors.numpy.save(weights, metadata={"manifest": json.dumps(manifest)})
     write_atomically(Path(path), content)
     return policy
 
@@ -74,7 +69,7 @@ def convert_policy(path: Path, out: Path) -> Policy:
     """
     manifest, weights = read_policy(path)
     with naming(path):
-        return write_policy(out, weights, upgrade(manifest))
+        return save_policy(out, weights, upgrade(manifest))
 
 
 def shipped_policies() -> dict[str, Path]:

@@ -1,9 +1,10 @@
 """NaN and infinity, from wherever they come, stop neither the training nor what it learns."""
 
+import collections
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -69,13 +70,7 @@ def test_numbers_too_great_to_be_squared_spoil_neither_statistics_nor_parameters
     assert int(state.gradient_steps) == asked - round(skipped * 2 * ITERATIONS)
 
 
-class Stepped(NamedTuple):
-    """What `step` returns."""
-
-    env_state: Any
-    transition: Any
-    valid: Any
-    metrics: Any
+Stepped = collections.namedtuple("Stepped", "env_state transition valid metrics")
 
 
 def stepped(env: Env, obs: list[list[float]], action: list[int]) -> Stepped:
