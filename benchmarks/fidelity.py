@@ -136,7 +136,9 @@ def engines(args: argparse.Namespace) -> None:
     duration = args.periods * policy.config.task.target_period
     cases, plain = [], []
     for suite in SUITES:
-        drawn = draw_suite(policy.config, suite, args.scenarios, duration, SEEDS.held_out)
+        drawn = draw_suite(
+            policy.config.task, policy.robot, suite, args.scenarios, duration, SEEDS.held_out
+        )
         plain.append(evaluation_course(policy, drawn, duration))
         cases.append((drawn, plain[-1].action))
     courses = {engine: env_courses(policy, engine, cases) for engine in ENGINES}
@@ -195,7 +197,7 @@ def contact(args: argparse.Namespace) -> None:
     policy = load_policy(args.policy)
     scene, rows = policy_scene(policy), []
     trunk = scene.trunk_quat[0] - np.asarray((3, 2))
-    drawn = draw_suite(policy.config, "corner", args.scenarios, DURATION, 0)
+    drawn = draw_suite(scene.task, scene.robot, "corner", args.scenarios, DURATION, 0)
     for name, settings in SETTINGS.items():
         controller = exploring(policy, 0.1)
         varied = with_settings(scene, settings)

@@ -86,13 +86,13 @@ def settling(task: TaskConfig, pushed: np.ndarray, calm: np.ndarray, at: np.ndar
 
 def push_row(name: str, scene: Scene, controller: Controller, scenarios: int) -> Row:
     """One controller, with pushes and without."""
-    drawn = draw_suite(scene.config, "push", scenarios, DURATION, SEEDS.held_out)
+    drawn = draw_suite(scene.task, scene.robot, "push", scenarios, DURATION, SEEDS.held_out)
     assert drawn.pushes is not None
     calm, pushed = (
         roll_out(scene, controller, episodes, DURATION)
         for episodes in (drawn._replace(pushes=None), drawn)
     )
-    times = settling(scene.config.task, pushed.tilt, calm.tilt, drawn.pushes.due[0])
+    times = settling(scene.task, pushed.tilt, calm.tilt, drawn.pushes.due[0])
     half, most = np.percentile(times, (50, 95)).tolist()
     return {
         "controller": name,

@@ -136,7 +136,7 @@ def batch_peer(scene: Scene, num_envs: int) -> tuple[Callable[[], Any], int]:
 
     The servo targets are random, as far from the stance as an action's, on a board that turns.
     """
-    task, stance, rng = scene.config.task, scene.stance, np.random.default_rng(0)
+    task, stance, rng = scene.task, scene.stance, np.random.default_rng(0)
     legs = stance.qpos[scene.leg_qpos] + stance.leg_trim
     turned = np.radians(task.board_rate * task.sim_dt) * np.arange(1, 1 + task.sim_steps)
     ctrl = np.zeros((num_envs, task.sim_steps, scene.model.nu))

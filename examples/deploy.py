@@ -27,11 +27,11 @@ def main() -> None:
     except PolicyError as error:
         parser.error(str(error))
     scene = policy_scene(load_policy(path))  # board and robot; the policy itself runs below
-    model, stance, task = scene.model, scene.stance, scene.config.task
+    model, stance, task = scene.model, scene.stance, scene.task
     data = mujoco.MjData(model)
     data.qpos, data.qacc_warmstart = stance.qpos, stance.qacc_warmstart
     data.sensordata[scene.imu] = stance.imu
-    boards = draw_suite(scene.config, "corner", 1, SECONDS, seed=0).scenario
+    boards = draw_suite(scene.task, scene.robot, "corner", 1, SECONDS, seed=0).scenario
     controller = Controller(path, clock=lambda: data.time)
     tilts = []
     while data.time < SECONDS:

@@ -4,9 +4,9 @@
 installed, this import registers `mjx_balance/Balance-v0`.
 """
 
+import contextlib
 from typing import TYPE_CHECKING
 
-from mjx_balance.envs.registration import register
 from mjx_balance.policy.file import load_policy
 from mjx_balance.quiet import quiet_imports
 
@@ -15,7 +15,18 @@ if TYPE_CHECKING:
 
 __all__ = ["BalanceEnv", "load_policy"]
 
-register()
+# A process that has not imported this package, such as a worker of a vector env, asks for
+# `mjx_balance:mjx_balance/Balance-v0`: Gymnasium imports what stands before the colon. A Gymnasium
+# that is missing or broken is no reason not to evaluate a policy.
+with contextlib.suppress(Exception):
+    import gymnasium
+
+    if "mjx_balance/Balance-v0" not in gymnasium.registry:
+        gymnasium.register(
+            "mjx_balance/Balance-v0",
+            entry_point="mjx_balance.envs.gym:BalanceGymEnv",
+            vector_entry_point="mjx_balance.envs.gym:BalanceVecEnv",
+        )
 
 
 def __getattr__(name: str) -> object:

@@ -217,7 +217,7 @@ def test_published_results_stand_while_the_code_gives_them(
         asked.append(scenarios)
         fell_at, action = np.full(scenarios, 5), np.zeros((scenarios, 1))
         tilts = np.full((scenarios, 5), tilt[0])
-        return Rollout(scene.config.task, tilts, fell_at, action, None, 1.0)
+        return Rollout(scene.task, tilts, fell_at, action, None, 1.0)
 
     def result(code: str, scenarios: int = 20) -> tuple[dict[str, Any], list[int]]:
         asked.clear()

@@ -82,7 +82,7 @@ def test_it_does_what_the_evaluation_does_step_by_step(
     """On the evaluation's own samples and joint angles, with noise and pushes."""
     policy = load_policy(BEST)
     scene = policy_scene(policy)
-    count, decisions, samples = 3, 30, scene.config.task.sim_steps
+    count, decisions, samples = 3, 30, scene.task.sim_steps
     imu, chosen, joints = [], [], []
 
     def controller(view: Any) -> np.ndarray:
@@ -167,9 +167,8 @@ def test_it_is_the_tasks_decision_for_any_layout_and_legs(
     actions = []
     for number in range(24):
         actions.append(int(policy(obs)))
-        now = np.asarray(float(number))
-        change = policy.actions[actions[-1]]
-        memory, targets = step.pre_step(task, robot, memory, change, None, level, now)
+        state = step.EnvState(None, memory, level, np.asarray(number), None, None)
+        memory, targets = step.pre_step(task, robot, state, policy.actions[actions[-1]])
         samples = still + rng.normal(0, (0.02, 0.02, 0.02, 0.2, 0.2, 0.2), (task.sim_steps, 6))
         for k in range(task.sim_steps):
             got = rig.step(angles, sample[:3], sample[3:])

@@ -58,7 +58,7 @@ def _video(scene: Scene, controller: Controller, args: EvaluateArgs) -> int:
     rollout = run_suite(scene, controller, args.suite, 1, args.duration, args.seed, record=True)
     assert rollout.qpos is not None
     try:
-        render.write(args.video, scene.config, rollout.qpos[0])
+        render.write(args.video, scene, rollout.qpos[0])
     except render.RenderError as error:
         return complain(f"no video written: {error}", FAILED)
     print(f"video of the first scenario: {args.video}")

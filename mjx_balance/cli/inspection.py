@@ -51,7 +51,7 @@ def tilt_board(scene: Scene) -> TiltTest:
 
 def _tilt_board(scene: Scene, ways: np.ndarray) -> TiltTest:
     """One tilt test; `ways` (2,) is +-1, the direction about the board's X and Y."""
-    model, task, robot = scene.model, scene.config.task, scene.robot
+    model, task, robot = scene.model, scene.task, scene.robot
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = scene.stance.qpos, scene.stance.qvel
     angle = math.radians(task.max_incline)
@@ -77,7 +77,7 @@ def _tilt_board(scene: Scene, ways: np.ndarray) -> TiltTest:
 
 def problems(scene: Scene, tilt_test: TiltTest) -> list[str]:
     """Reasons why the robot is not ready for training, one sentence each."""
-    task, name, sentences = scene.config.task, scene.robot.name, []
+    task, name, sentences = scene.task, scene.robot.name, []
     place = f"at {task.max_incline:g} deg on both axes"
     if tilt_test.tilt > task.fail_tilt:
         sentences.append(
@@ -99,7 +99,7 @@ def _most_loaded(scene: Scene, tilt_test: TiltTest) -> tuple[str, float]:
 
 def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
     """Describes the robot and the result of its tilt test, line by line."""
-    robot, task = scene.robot, scene.config.task
+    robot, task = scene.robot, scene.task
     low, high = robot.height_range
     able, reach = authority(task, robot), greatest_incline(task, robot)
     return [
@@ -137,7 +137,7 @@ def _standing(scene: Scene, tilt_test: TiltTest) -> str:
     loaded = f"the most loaded servo, {joint}, takes {100 * share:.0f}% of its torque"
     if UNLIMITED in (scene.robot.hip_torque, scene.robot.knee_torque):
         loaded = "its model limits no torque: say hip_torque and knee_torque, in N m"
-    place = f"at {scene.config.task.max_incline:g} deg on both axes"
+    place = f"at {scene.task.max_incline:g} deg on both axes"
     return f"{place} it {still}, level to {tilt_test.tilt:.2f} deg; {loaded}"
 
 

@@ -35,7 +35,7 @@ def check(robot: Positional[str], picture: Path | None = None) -> int:
         complain(sentence)
     picture = picture or Path(f"{scene.robot.name.replace(':', '_')}-check.png")
     try:
-        render.write(picture, scene.config, tilt_test.qpos[None])
+        render.write(picture, scene, tilt_test.qpos[None])
     except render.RenderError as error:
         return complain(f"no picture drawn: {error}", FAILED)
     print(f"picture: {picture}")

@@ -45,7 +45,7 @@ def view(argv: list[str]) -> int:
     scene, controller = args.load()
     session = Session(scene, controller, args.suite, args.seed)
     try:
-        window = render.Window(scene.config, session.press)
+        window = render.Window(scene, session.press)
     except render.RenderError as error:
         return complain(f"{error}; `mjx-balance evaluate --video` needs no display")
     above, below = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
@@ -71,7 +71,7 @@ class Session:
           SuiteError: if the suite does not exist, or the seed is negative.
         """
         check_seed(seed)
-        self.scene, self.task, self.controller = scene, scene.config.task, controller
+        self.scene, self.task, self.controller = scene, scene.task, controller
         self.suite, self.seed = suite, seed
         self.max_incline = greatest_incline(self.task, scene.robot)
         self.rng = np.random.default_rng(seed)
@@ -85,7 +85,7 @@ class Session:
         else:
             duration = self.task.episode_length * self.task.ctrl_dt
             seed = self.seed + self.rounds
-            episodes = draw_suite(self.scene.config, self.suite, 1, duration, seed)
+            episodes = draw_suite(self.scene.task, self.scene.robot, self.suite, 1, duration, seed)
         self.suite_pushes = episodes.pushes or Pushes(np.zeros((1, 0, 2)), np.zeros((1, 0), int))
         self.env = BatchEnv(self.scene, episodes, threads=1)
         self.obs = self.env.initial_obs

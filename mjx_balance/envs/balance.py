@@ -10,8 +10,7 @@ from brax.envs.base import Env, State
 from mjx_balance.config import ACTION_AXES, Config, check, preset
 from mjx_balance.envs.metrics import Metric
 from mjx_balance.sim.engines.table import make_engine
-from mjx_balance.sim.scene import Scene, load_scene
-from mjx_balance.task import tilt
+from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.observation import input_rows
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
@@ -19,6 +18,7 @@ from mjx_balance.task.randomization import DRAWS, draw_params
 from mjx_balance.task.reward import reward_rows
 from mjx_balance.task.step import EnvState, initial_memory, observation, step
 from mjx_balance.task.symmetry import Symmetries, symmetries
+from mjx_balance.task.tilt import draw_scenario
 
 
 class BalanceEnv(Env):
@@ -54,11 +54,9 @@ class BalanceEnv(Env):
         """
         self._discrete = check_action(action) == "discrete"
         self.config = check(config or preset("default"))
-        self.scene: Scene = load_scene(self.config)
+        self.scene = load_scene(self.config)
         self.engine = make_engine(self.config, self.scene)
         self._table = action_table(self.config.task)
-        ranges, task = self.config.randomization, self.config.task
-        self._push_decisions = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
 
     @property
     def observation_size(self) -> int:
@@ -85,33 +83,31 @@ class BalanceEnv(Env):
         return self.config.engine
 
     def reset(self, rng: jax.Array) -> State:
-        """Starts a fresh tilt scenario from the settled stance.
-
-        Args:
-          rng: PRNG key.
-
-        Returns:
-          State with obs (obs_size,).
-        """
+        """Starts a fresh tilt scenario from the settled stance, by a PRNG key."""
         task, robot, scene = self.config.task, self.scene.robot, self.scene
+        ranges, params, pushes = self.config.randomization, None, None
         # No key depends on how many are split off: pushes change no other draw.
         rng, key_params, key_noise, key_pushes = jax.random.split(rng, 4)
         info = {
             "episode_length": jnp.int32(task.episode_length),
             "truncation": jnp.float32(0.0),
         }
-        params, pushes, ranges = None, None, self.config.randomization
         if ranges.varies:
             params = draw_params(ranges, robot, jax.random.uniform(key_params, (DRAWS,)))
             info["noise_key"] = key_noise
-        if len(self._push_decisions):
-            uniform = jax.random.uniform(key_pushes, (len(self._push_decisions), 2))
-            due = jnp.asarray(self._push_decisions, jnp.int32)
-            pushes = Pushes(draw_velocity(ranges, uniform), due)
+        due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
+        if len(due):
+            uniform = jax.random.uniform(key_pushes, (len(due), 2))
+            pushes = Pushes(draw_velocity(ranges, uniform), jnp.asarray(due, jnp.int32))
+        keys = iter(jax.random.split(rng, 4))
+
+        def uniform(shape: tuple[int, ...], low: float, high: float) -> jax.Array:
+            return jax.random.uniform(next(keys), shape, minval=low, maxval=high)
+
         start = EnvState(
             physics=self.engine.initial(),
             memory=initial_memory(task, robot, jnp.asarray(scene.stance.imu, jnp.float32)),
-            scenario=self._scenario(rng),
+            scenario=draw_scenario(task, uniform),
             env_steps=jnp.int32(0),
             params=params,
             pushes=pushes,
@@ -136,14 +132,9 @@ class BalanceEnv(Env):
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Takes one decision.
+        """Takes one decision, and returns the state `ctrl_dt` later.
 
-        Args:
-          state: from `reset` or `step`.
-          action: () action index, 0 to action_size - 1; or (2,), clipped to -1 to 1.
-
-        Returns:
-          The state `ctrl_dt` later.
+        `action` is an index, 0 to action_size - 1, or two shares, clipped to -1 to 1.
         """
         task, info, noise = self.config.task, state.info, None
         if "noise_key" in info:
@@ -151,9 +142,11 @@ class BalanceEnv(Env):
             noise = jax.random.normal(key_noise, (task.sim_steps, 6))
             info = info | {"noise_key": key}
         before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        after, outcome = step(
-            task, self.scene.robot, self.engine, before, self._change(action), noise
-        )
+        if self._discrete:
+            change = jnp.asarray(self._table)[action]
+        else:
+            change = task.action_max * jnp.clip(action, -1.0, 1.0)
+        after, outcome = step(task, self.scene.robot, self.engine, before, change, noise)
         truncated = ~outcome.terminated & (after.env_steps >= info["episode_length"])
         metrics = {
             "tilt_deg": outcome.tilt.mean(),
@@ -168,18 +161,4 @@ class BalanceEnv(Env):
             done=(outcome.terminated | truncated).astype(jnp.float32),
             metrics=state.metrics | metrics,
             info=info | {"truncation": truncated.astype(jnp.float32)},
-        )
-
-    def _change(self, action: jax.Array) -> jax.Array:
-        """Height changes (2,) of an action, m."""
-        if self._discrete:
-            return jnp.asarray(self._table)[action]
-        return self.config.task.action_max * jnp.clip(action, -1.0, 1.0)
-
-    def _scenario(self, key: jax.Array) -> tilt.Scenario:
-        """Draws the targets, and the age of the first."""
-        keys = iter(jax.random.split(key, 4))
-        return tilt.draw_scenario(
-            self.config.task,
-            lambda shape, low, high: jax.random.uniform(next(keys), shape, minval=low, maxval=high),
         )

@@ -7,70 +7,65 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from mjx_balance.config import Config
+from mjx_balance.config import RandomizationConfig, TaskConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.sim.engines.mujoco import MujocoEngine
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task import tilt
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
 from mjx_balance.task.step import EnvState, Outcome, initial_memory, observation, step
+from mjx_balance.task.tilt import Scenario, draw_scenario
 
 
 class Episodes(NamedTuple):
-    """What n episodes consist of, besides a robot and its actions."""
+    """What n episodes consist of, besides a robot and its actions; all arrays begin with n."""
 
-    scenario: tilt.Scenario
-    """Where the boards go, (n, ...) per field."""
+    scenario: Scenario
+    """Where the boards go."""
     params: DomainParams | None = None
-    """(n, ...) per field; None: nominal."""
+    """None: nominal."""
     pushes: Pushes | None = None
-    """(n, ...) per field; None: no pushes."""
+    """None: no pushes."""
     rngs: Sequence[np.random.Generator] = ()
     """Of each episode, for its sensor noise; needed where `params` has some."""
 
 
-def draw_episodes(config: Config, robot: Robot, rngs: Sequence[np.random.Generator]) -> Episodes:
+def draw_episodes(
+    task: TaskConfig,
+    ranges: RandomizationConfig,
+    robot: Robot,
+    rngs: Sequence[np.random.Generator],
+) -> Episodes:
     """Draws episodes of training, each from its own generator, as `BalanceEnv` draws its own.
 
     Args:
-      config: task and randomisation.
+      task: of the scenarios.
+      ranges: of domain parameters and pushes.
       robot: the nominal friction.
       rngs: of each episode; its sensor noise comes from it, too.
     """
-    task, ranges = config.task, config.randomization
     due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
     params, pushes = None, None
-
-    def scenario(rng: np.random.Generator) -> tilt.Scenario:
-        return tilt.draw_scenario(
-            task, lambda shape, low, high: np.asarray(rng.uniform(low, high, shape))
-        )
-
-    scenarios = [scenario(rng) for rng in rngs]
+    scenarios = [
+        draw_scenario(task, lambda shape, low, high: np.asarray(rng.uniform(low, high, shape)))  # noqa: B023
+        for rng in rngs
+    ]
     if ranges.varies:
         params = draw_params(ranges, robot, np.stack([rng.uniform(size=DRAWS) for rng in rngs]))
     if len(due):
         uniform = np.stack([rng.uniform(size=(len(due), 2)) for rng in rngs])
         pushes = Pushes(draw_velocity(ranges, uniform), np.tile(due, (len(rngs), 1)))
-    return Episodes(
-        tilt.Scenario(*map(np.stack, zip(*scenarios, strict=True))), params, pushes, rngs
-    )
+    return Episodes(Scenario(*map(np.stack, zip(*scenarios, strict=True))), params, pushes, rngs)
 
 
 class BatchEnv:
     """n envs of one scene. `step` resets none of them."""
 
     def __init__(self, scene: Scene, episodes: Episodes, threads: int | None = None):
-        """Starts all envs: robots settled on level boards.
-
-        Args:
-          scene: model, stance and task.
-          episodes: of each env.
-          threads: worker threads; None: all cores.
-        """
-        self.scene, self.task = scene, scene.config.task
+        """Starts all envs, robots settled on level boards, with worker threads; None: all cores."""
+        self.scene, self.task = scene, scene.task
         self.num_envs = len(episodes.scenario.phase)
         self._engine = MujocoEngine(scene, self.num_envs, threads)
         self.state = self._initial(np.arange(self.num_envs), episodes)
@@ -79,8 +74,8 @@ class BatchEnv:
         self.initial_obs = observation(self.task, scene.robot, self.state.memory, angles)
         """(n, obs_size) of robots that have just been reset."""
 
-    def reset(self, ids: np.ndarray, episodes: Episodes) -> None:
-        """Starts envs `ids` (n,) anew with episodes (n,) that have what the first ones had."""
+    def reset(self, ids: Int[np.ndarray, " k"], episodes: Episodes) -> None:
+        """Starts envs `ids` anew with episodes that have what the first ones had."""
         _set_rows(self.state, ids, self._initial(ids, episodes))
         self._engine.reset(ids)
         for k, rng in zip(ids, episodes.rngs, strict=True):
@@ -88,26 +83,15 @@ class BatchEnv:
 
     def _initial(self, ids: np.ndarray, episodes: Episodes) -> EnvState:
         still = np.tile(self.scene.stance.imu, (len(ids), 1))
-        state = EnvState(
-            physics=ids,
-            memory=initial_memory(self.task, self.scene.robot, still),
-            scenario=episodes.scenario,
-            env_steps=np.zeros(len(ids), int),
-            params=episodes.params,
-            pushes=episodes.pushes,
-        )
-        return _mapped(np.array, state)  # a copy, which may be written to
+        memory = initial_memory(self.task, self.scene.robot, still)
+        env_steps = np.zeros(len(ids), int)
+        state = EnvState(ids, memory, episodes.scenario, env_steps, *episodes[1:3])
+        return _tree_map(np.array, state)  # a copy, which may be written to
 
-    def step(self, change: np.ndarray, ids: np.ndarray | None = None) -> Outcome:
-        """Takes one decision.
-
-        Args:
-          change: (n, 2) a_x and a_y of the actions, m.
-          ids: (n,) envs that take it; None: all.
-
-        Returns:
-          The outcome (n, ...).
-        """
+    def step(
+        self, change: Float[np.ndarray, "k 2"], ids: Int[np.ndarray, " k"] | None = None
+    ) -> Outcome:
+        """Takes one decision, in envs `ids` or all; `change` is a_x and a_y of the actions, m."""
         ids = np.arange(self.num_envs) if ids is None else ids
         before = rows(self.state, ids)
         noise, params = None, before.params
@@ -120,39 +104,36 @@ class BatchEnv:
         return outcome
 
     @property
-    def path(self) -> np.ndarray:
-        """(n, sim_steps, nq) after each physics step of the last decision, of its envs."""
+    def path(self) -> Float[np.ndarray, "k sim_steps nq"]:
+        """States after each physics step of the last decision, of its envs."""
         return self._engine.recorded["qpos"]
 
     @property
-    def qpos(self) -> np.ndarray:
-        """(num_envs, nq) now."""
+    def qpos(self) -> Float[np.ndarray, "n nq"]:
+        """Positions now."""
         return self._engine.state()[0]
 
     @property
-    def qvel(self) -> np.ndarray:
-        """(num_envs, nv) now."""
+    def qvel(self) -> Float[np.ndarray, "n nv"]:
+        """Velocities now."""
         return self._engine.state()[1]
 
 
 def rows(tree: Any, ids: np.ndarray) -> Any:
     """Rows `ids` of all arrays of nested tuples."""
-    return _mapped(lambda x: x[ids], tree)
+    return _tree_map(lambda x: x[ids], tree)
 
 
-def _mapped(function: Callable[[np.ndarray], np.ndarray], tree: Any) -> Any:
+def _set_rows(tree: Any, ids: np.ndarray, values: Any) -> None:
+    """Writes rows `ids` of all arrays of nested tuples."""
+    _tree_map(lambda part, value: part.__setitem__(ids, value), tree, values)
+
+
+def _tree_map(function: Callable[..., Any], tree: Any, *rest: Any) -> Any:
     """`jax.tree.map` of nested tuples, without JAX."""
     if tree is None:
         return None
     if isinstance(tree, tuple):
-        return type(tree)(*(_mapped(function, part) for part in tree))
-    return function(tree)
-
-
-def _set_rows(batch: Any, ids: np.ndarray, values: Any) -> None:
-    """Writes rows `ids` of all arrays of nested tuples."""
-    if isinstance(batch, tuple):
-        for part, part_values in zip(batch, values, strict=True):
-            _set_rows(part, ids, part_values)
-    elif batch is not None:
-        batch[ids] = values
+        parts = zip(tree, *rest, strict=True)
+        return type(tree)(*(_tree_map(function, *part) for part in parts))
+    return function(tree, *rest)

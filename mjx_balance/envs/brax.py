@@ -37,14 +37,9 @@ def wrap(
 ) -> Wrapper:
     """As `brax.envs.training.wrap`, but that every episode is a new scenario.
 
-    Args:
-      env: one board.
-      episode_length: decisions until brax cuts an episode off; at most the env's own.
-      action_repeat: decisions that take the same action.
-      randomization_fn: None; domain parameters are drawn as the env's config says.
-
     Raises:
-      ValueError: for a longer episode, or a randomization_fn.
+      ValueError: if `episode_length` is above the env's own, or there is a randomization_fn: the
+        env's config says how domain parameters are drawn.
     """
     longest = env.config.task.episode_length
     if episode_length > longest:

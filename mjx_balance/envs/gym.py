@@ -1,6 +1,6 @@
 """The task as Gymnasium's envs, in plain MuJoCo: one env, or many at once. No JAX.
 
-`import mjx_balance` registers them (`registration.py`).
+`import mjx_balance` registers them.
 """
 
 from collections.abc import Sequence
@@ -14,62 +14,18 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mjx_balance.config import Config, ConfigError, TaskConfig, check
+from mjx_balance.config import Config, ConfigError, check
 from mjx_balance.config import preset as find_preset
 from mjx_balance.envs.batch import BatchEnv, draw_episodes
 from mjx_balance.files.text import quote
 from mjx_balance.render.drawing import Painter, RenderError, Window
-from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.observation import input_rows
 from mjx_balance.task.step import DIVERGED, Outcome
 
-
-class _Actions:
-    """The action space, and what its elements do."""
-
-    def __init__(self, task: TaskConfig, kind: str):
-        self._most = task.action_max
-        self._table = action_table(task) if check_action(kind) == "discrete" else None
-        self.space: spaces.Space = (
-            spaces.Discrete(len(self._table))
-            if self._table is not None
-            else spaces.Box(-1, 1, (2,), np.float32)
-        )
-
-    def read(self, action: Any, space: spaces.Space) -> np.ndarray:
-        """The action or actions as an array of a space that holds them.
-
-        Raises:
-          InvalidAction: if an action is outside the space.
-        """
-        # Of a space of several whole numbers, older versions of Gymnasium take any for one.
-        kinds = "iu" if self._table is not None else "f"
-        try:
-            array = np.asarray(action)
-            if self._table is None:  # a share is as good in float64
-                with np.errstate(over="ignore"):
-                    array = array.astype(np.float32)
-        except (TypeError, ValueError):
-            array = None
-        if array is None or array.dtype.kind not in kinds or not space.contains(array):
-            raise InvalidAction(f"{_named(action, array, self.space)}; it must be in {space}")
-        return array
-
-    def change(self, actions: np.ndarray) -> np.ndarray:
-        """Height changes (n, 2), m, of actions (n,) or (n, 2)."""
-        return self._most * actions if self._table is None else self._table[actions]
-
-
-def _named(action: Any, array: np.ndarray | None, single: spaces.Space) -> str:
-    """Names an action outside its space, or the first of several."""
-    if array is not None and array.ndim == len(single.shape or ()) + 1:
-        for k, own in enumerate(array):
-            if not single.contains(own):
-                return f"action {k} is {quote(own.tolist())}"
-    return f"action is {quote(action)}"
+NO_EPISODE = "no episode is under way; call reset() before step()"
 
 
 def _config(preset: str | None, config: Config | None, robot: str | None) -> Config:
@@ -91,48 +47,14 @@ def _check_options(options: dict[str, Any] | None) -> None:
         raise ValueError(f"options is {quote(options)}; it must be None or {{}}: there are none")
 
 
-def _seeds(seed: Any, count: int) -> list[int | None]:
-    """Seed of each env, or None.
+class _Balance:
+    """What one env and many have in common: scene, actions, episodes and pictures."""
 
-    Raises:
-      ValueError: if there are not as many as envs.
-    """
-    if seed is None:
-        return [None] * count
-    if isinstance(seed, int | np.integer):
-        return [int(seed) + k for k in range(count)]
-    seeds = np.asarray(seed, object)
-    if seeds.ndim != 1:
-        raise ValueError(
-            f"seed is {quote(seed)}; it must be a whole number, or one or None for each env"
-        )
-    if len(seeds) != count:
-        raise ValueError(f"{len(seeds)} seeds are given for {count} envs")
-    return [int(x) if isinstance(x, np.integer) else x for x in seeds]
-
-
-def _observations(task: TaskConfig, robot: Robot) -> spaces.Box:
-    """All that `task.step` lets through; larger values are a diverged simulation's."""
-    scale = np.asarray([row.scale for row in input_rows(task, robot)], np.float32)
-    most = DIVERGED / scale
-    return spaces.Box(-most, most, dtype=np.float32)
-
-
-def _check_mode(mode: str | None, known: Sequence[str]) -> None:
-    if mode is not None and mode not in known:
-        raise UnsupportedMode(
-            f"render_mode is {quote(mode)}; it must be one of {', '.join(known)}, or None"
-        )
-
-
-class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
-    """A quadruped on a board that tilts in two axes: `BalanceEnv` in plain MuJoCo.
-
-    A step is a decision of `ctrl_dt`. A fall terminates an episode, the time limit truncates it.
-    `info` holds `tilt_deg`, the body's tilt, its mean over the decision, and `fall`.
-    """
-
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # noqa: RUF012
+    metadata: dict[str, Any]
+    threads: int | None = None
+    """Worker threads; None: all cores."""
+    # Of the class: an env whose constructor failed is closed, too.
+    _painter: Painter | None = None
 
     def __init__(
         self,
@@ -149,8 +71,8 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
           config: instead of preset and robot; its task, robot and randomisation are what counts.
           action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
             `action_max`, -1 to 1.
-          render_mode: "human", a window in which every decision takes its time; "rgb_array"; or
-            none.
+          render_mode: "human", a window in which every decision takes its time (of one env);
+            "rgb_array"; or none.
           robot: as `Config.robot`, for which the preset is made; our own if none.
 
         Raises:
@@ -158,42 +80,99 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
             run.
           UnsupportedMode: for another render mode.
         """
-        _check_mode(render_mode, self.metadata["render_modes"])
+        known = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in known:
+            raise UnsupportedMode(
+                f"render_mode is {quote(render_mode)}; it must be one of {', '.join(known)}, or "
+                "None"
+            )
         self.config = check(_config(preset, config, robot))
         self.scene = load_scene(self.config)
         self.batch: BatchEnv | None = None
-        task = self.config.task
-        self._actions = _Actions(task, action)
-        self.action_space = self._actions.space
-        self.observation_space = _observations(task, self.scene.robot)
         self.render_mode = render_mode
+        task = self.config.task
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
-        self._running = False
-        self._window: Window | None = None
-        self._painter: Painter | None = None
+        self._table = action_table(task) if check_action(action) == "discrete" else None
+        shares = spaces.Box(-1, 1, (2,), np.float32)
+        single = shares if self._table is None else spaces.Discrete(len(self._table))
+        self.action_space = self.single_action_space = single
+        # All that `task.step` lets through; larger values are a diverged simulation's.
+        scale = [row.scale for row in input_rows(task, self.scene.robot)]
+        most = DIVERGED / np.asarray(scale, np.float32)
+        self.observation_space = self.single_observation_space = spaces.Box(-most, most)
+
+    def _start(self, rngs: Sequence[np.random.Generator], ids: np.ndarray) -> np.ndarray:
+        """Starts an episode from each generator in envs `ids`; returns all first observations."""
+        config = self.config
+        episodes = draw_episodes(config.task, config.randomization, self.scene.robot, rngs)
+        if self.batch is None:
+            self.batch = BatchEnv(self.scene, episodes, self.threads)
+        else:
+            self.batch.reset(ids, episodes)
+        return self.batch.initial_obs.astype(np.float32)
+
+    def _height_changes(self, action: Any, space: spaces.Space) -> np.ndarray:
+        """Height changes (..., 2), m, of an action, or of one per env, that must be in `space`."""
+        # Of a space of several whole numbers, older versions of Gymnasium take any for one.
+        kinds = "f" if self._table is None else "iu"
+        try:
+            array = np.asarray(action)
+            if self._table is None:  # a share is as good in float64
+                with np.errstate(over="ignore"):
+                    array = array.astype(np.float32)
+        except (TypeError, ValueError):
+            array = None
+        if array is None or array.dtype.kind not in kinds or not space.contains(array):
+            raise InvalidAction(f"{self._invalid(action, array)}; it must be in {space}")
+        return self.config.task.action_max * array if self._table is None else self._table[array]
+
+    def _invalid(self, action: Any, array: np.ndarray | None) -> str:
+        """Names an action outside its space, or the first of several."""
+        if array is not None and array.ndim == len(self.single_action_space.shape or ()) + 1:
+            for k, own in enumerate(array):
+                if not self.single_action_space.contains(own):
+                    return f"action {k} is {quote(own.tolist())}"
+        return f"action is {quote(action)}"
+
+    def _draw(self, count: int) -> tuple[np.ndarray, ...] | None:
+        """A picture (height, width, 3) of each env, or None without render mode `rgb_array`."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() gives no picture without a render_mode; choose one")
+        if self.render_mode != "rgb_array":
+            return None
+        self._painter = self._painter or Painter(self.scene)
+        stance = [self.scene.stance.qpos] * count
+        states = stance if self.batch is None else self.batch.qpos
+        return tuple(self._painter.draw(state) for state in states)
+
+
+class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
+    """A quadruped on a board that tilts in two axes: `BalanceEnv` in plain MuJoCo.
+
+    A step is a decision of `ctrl_dt`. A fall terminates an episode, the time limit truncates it.
+    `info` holds `tilt_deg`, the body's tilt, its mean over the decision, and `fall`.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # noqa: RUF012
+    threads = 1
+    _window: Window | None = None
+    _running = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts a fresh scenario from the settled stance.
-
-        Args:
-          seed: of the scenarios from here on; none: the generator goes on.
-          options: there are none.
+        """Starts a fresh scenario from the settled stance; without a seed the generator goes on.
 
         Raises:
-          ValueError: if there are options.
+          ValueError: if there are options; none exist.
         """
         _check_options(options)
         super().reset(seed=seed)
-        episodes = draw_episodes(self.config, self.scene.robot, [self.np_random])
-        if self.batch is None:
-            self.batch = BatchEnv(self.scene, episodes, threads=1)
-        else:
-            self.batch.reset(np.arange(1), episodes)
+        obs = self._start([self.np_random], np.arange(1))
         self._running = True
+        assert self.batch is not None
         self._show(self.batch.qpos[:, None])
-        return self.batch.initial_obs[0].astype(np.float32), {}
+        return obs[0], {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Takes one decision.
@@ -203,9 +182,8 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
           ResetNeeded: before the first reset, and after the end of an episode.
         """
         if not self._running or self.batch is None:
-            raise ResetNeeded("no episode is under way; call reset() before step()")
-        read = self._actions.read(action, self.action_space)
-        outcome = self.batch.step(self._actions.change(read[None]))
+            raise ResetNeeded(NO_EPISODE)
+        outcome = self.batch.step(self._height_changes(action, self.action_space)[None])
         self._show(self.batch.path)
         terminated = bool(outcome.terminated[0])
         truncated = bool(_truncated(self.batch, outcome)[0])
@@ -216,13 +194,8 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
 
     def render(self) -> np.ndarray | None:
         """The picture (height, width, 3) of `rgb_array`; a window needs no call."""
-        if self.render_mode is None:
-            gymnasium.logger.warn("render() gives no picture without a render_mode; choose one")
-        if self.render_mode != "rgb_array":
-            return None
-        self._painter = self._painter or Painter(self.config)
-        qpos = self.scene.stance.qpos if self.batch is None else self.batch.qpos[0]
-        return self._painter.draw(qpos)
+        pictures = self._draw(1)
+        return None if pictures is None else pictures[0]
 
     def close(self) -> None:
         """Closes the window and ends the process that draws."""
@@ -237,13 +210,13 @@ class BalanceGymEnv(gymnasium.Env[np.ndarray, Any]):
             return
         if self._window is None:
             try:
-                self._window = Window(self.config)
+                self._window = Window(self.scene)
             except RenderError as error:
                 raise RenderError(f"{error}; render_mode 'rgb_array' needs no display") from error
         self._window.play(qpos[0])
 
 
-class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many envs in `mujoco.batch.Batch`, on all cores; env k does what one alone would do.
 
     An env that terminates or is truncated is reset in the same step: its observation is the first
@@ -255,47 +228,16 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         "render_fps": 5,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
-    # Of the class: an env whose constructor failed is closed, too.
-    _painter: Painter | None = None
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        preset: str | None = None,
-        config: Config | None = None,
-        action: str = "discrete",
-        render_mode: str | None = None,
-        robot: str | None = None,
-    ):
-        """Builds the scene.
-
-        Args:
-          num_envs: how many.
-          preset: name of the config.
-          config: instead of preset and robot.
-          action: "discrete" or "continuous".
-          render_mode: "rgb_array", one picture for each board, or none.
-          robot: for which the preset is made.
-
-        Raises:
-          ConfigError: as `BalanceGymEnv`.
-          UnsupportedMode: as `BalanceGymEnv`.
-        """
-        _check_mode(render_mode, self.metadata["render_modes"])
+    def __init__(self, num_envs: int = 1, *arguments: Any, **keywords: Any):
+        """Builds the scene of `num_envs` envs; the other arguments are those of `BalanceGymEnv`."""
         whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
         if not whole or num_envs < 1:
             raise ConfigError(f"num_envs is {quote(num_envs)}; it must be a whole number above 0")
-        self.config = check(_config(preset, config, robot))
-        self.scene = load_scene(self.config)
-        self.batch: BatchEnv | None = None
-        task = self.config.task
-        self._actions = _Actions(task, action)
-        self.num_envs, self.render_mode = num_envs, render_mode
-        self.single_action_space = self._actions.space
-        self.single_observation_space = _observations(task, self.scene.robot)
+        super().__init__(*arguments, **keywords)
+        self.num_envs = num_envs
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
         self._rngs: list[np.random.Generator] = []
 
     def reset(
@@ -306,13 +248,11 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts fresh scenarios in all envs.
 
-        Args:
-          seed: env k gets `seed + k`, or `seed[k]`; one that gets none goes on with its
-            generator.
-          options: there are none; `reset_mask` is for envs that do not reset by themselves.
+        Env k gets seed `seed + k`, or `seed[k]`; one that gets none goes on with its generator.
 
         Raises:
-          ValueError: if there are options, or not as many seeds as envs.
+          ValueError: if there are options (none exist; `reset_mask` is for envs that do not reset
+            by themselves), or not as many seeds as envs.
         """
         _check_options(options)
         seeds = _seeds(seed, self.num_envs)
@@ -321,12 +261,7 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             np_random(number)[0] if rng is None or number is not None else rng
             for number, rng in zip(seeds, old, strict=True)
         ]
-        episodes = draw_episodes(self.config, self.scene.robot, self._rngs)
-        if self.batch is None:
-            self.batch = BatchEnv(self.scene, episodes)
-        else:
-            self.batch.reset(np.arange(self.num_envs), episodes)
-        return self.batch.initial_obs.astype(np.float32), {}
+        return self._start(self._rngs, np.arange(self.num_envs)), {}
 
     def step(
         self, actions: Any
@@ -338,9 +273,8 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
           ResetNeeded: before the first reset.
         """
         if self.batch is None:
-            raise ResetNeeded("no episode is under way; call reset() before step()")
-        read = self._actions.read(actions, self.action_space)
-        outcome = self.batch.step(self._actions.change(read))
+            raise ResetNeeded(NO_EPISODE)
+        outcome = self.batch.step(self._height_changes(actions, self.action_space))
         terminated, truncated = outcome.terminated, _truncated(self.batch, outcome)
         done = terminated | truncated
         obs, info = outcome.obs.astype(np.float32), _info(outcome, ~done)
@@ -351,20 +285,12 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 final[k] = obs[k].copy()
             info |= {"final_obs": final, "_final_obs": done}
             info |= {"final_info": _info(outcome, done), "_final_info": done.copy()}
-            rngs = [self._rngs[k] for k in ids]
-            self.batch.reset(ids, draw_episodes(self.config, self.scene.robot, rngs))
-            obs[ids] = self.batch.initial_obs[ids]
+            obs[ids] = self._start([self._rngs[k] for k in ids], ids)[ids]
         return obs, outcome.reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture (height, width, 3) of each env."""
-        if self.render_mode is None:
-            gymnasium.logger.warn("render() gives no picture without a render_mode; choose one")
-            return None
-        self._painter = self._painter or Painter(self.config)
-        stance = np.tile(self.scene.stance.qpos, (self.num_envs, 1))
-        states = stance if self.batch is None else self.batch.qpos
-        return tuple(self._painter.draw(state) for state in states)
+        return self._draw(self.num_envs)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the process that draws."""
@@ -375,6 +301,20 @@ class BalanceVecEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore
         """Of each env; none before the first reset."""
         return tuple(self._rngs)
+
+
+def _seeds(seed: Any, count: int) -> list[int | None]:
+    """Seed of each env, or None."""
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + k for k in range(count)]
+    seeds = np.asarray([None] * count if seed is None else seed, object)
+    if seeds.ndim != 1:
+        raise ValueError(
+            f"seed is {quote(seed)}; it must be a whole number, or one or None for each env"
+        )
+    if len(seeds) != count:
+        raise ValueError(f"{len(seeds)} seeds are given for {count} envs")
+    return [int(x) if isinstance(x, np.integer) else x for x in seeds]
 
 
 def _truncated(batch: BatchEnv, outcome: Outcome) -> np.ndarray:

@@ -56,7 +56,7 @@ class Response(NamedTuple):
 
 def measure_response(scene: Scene) -> Response:
     """Takes one action on each axis, on the level board, and watches the body."""
-    task = scene.config.task
+    task = scene.task
     change = task.action_max / 2 * np.eye(ACTION_AXES)
     axes, still = np.arange(ACTION_AXES), np.zeros(ACTION_AXES)
     level = tilt.Scenario(np.zeros((ACTION_AXES, 1, 2)), still, still + task.board_rate)
@@ -76,7 +76,7 @@ def attitude(scene: Scene, view: View) -> np.ndarray:
 
 def stand(scene: Scene) -> Controller:
     """Never moves."""
-    action = nearest_action(scene.config.task, np.zeros(ACTION_AXES))
+    action = nearest_action(scene.task, np.zeros(ACTION_AXES))
     return lambda view: np.full(len(view.ids), action)
 
 
@@ -91,7 +91,7 @@ class AttitudePD:
           proportional: share of the tilt undone by one decision (benchmarks/limits.py).
           rate: time for which the present rate is undone beforehand, s (same).
         """
-        self.scene, self.task = scene, scene.config.task
+        self.scene, self.task = scene, scene.task
         self.proportional, self.rate = proportional, rate
         self.gain = measure_response(scene).gain
 
@@ -161,7 +161,7 @@ class Predictive:
           forecast: (task, scenario, now (n,), ahead (m,)) -> (n, m, 2) change of the
             board's angles, deg.
         """
-        self.scene, self.task, self.forecast = scene, scene.config.task, forecast
+        self.scene, self.task, self.forecast = scene, scene.task, forecast
         response, steps = measure_response(scene), self.task.sim_steps
         self.gain = response.gain
         # effect[axis, j, t]: deg at step t per deg of action j

@@ -64,10 +64,12 @@ def envelope(
     cells = [(i, r) for i in ENVELOPE_INCLINES for r in ENVELOPE_RATES]
     # So that even the slowest board arrives; `corner` alone needs less.
     slowest = 2 * max(ENVELOPE_INCLINES) / min(ENVELOPE_RATES)
-    task = scene.config.task
+    task = scene.task
     task = dataclasses.replace(task, target_period=max(task.target_period, slowest))
-    scene = dataclasses.replace(scene, config=dataclasses.replace(scene.config, task=task))
-    drawn = draw_suite(scene.config, "corner", len(cells) * scenarios, duration, seed).scenario
+    scene = dataclasses.replace(scene, task=task)
+    drawn = draw_suite(
+        scene.task, scene.robot, "corner", len(cells) * scenarios, duration, seed
+    ).scenario
     incline, rate = np.repeat(np.asarray(cells), scenarios, axis=0).T
     drawn = drawn._replace(targets=incline[:, None, None] * np.sign(drawn.targets), rate=rate)
     rollout = roll_out(scene, controller, Episodes(drawn), duration, progress=progress)
@@ -77,7 +79,7 @@ def envelope(
         rates=list(ENVELOPE_RATES),
         fall_rate=rollout.fell.reshape(shape).mean(axis=-1).tolist(),
         mean_tilt=rollout.tilt.mean(axis=-1).reshape(shape).mean(axis=-1).tolist(),
-        authority=authority(scene.config.task, scene.robot),
+        authority=authority(scene.task, scene.robot),
         reach=greatest_incline(task, scene.robot),
         scenarios=scenarios,
         duration_s=duration,

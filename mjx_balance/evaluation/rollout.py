@@ -97,7 +97,7 @@ def roll_out(
       record: whether to record every qpos.
       progress: called with the share done.
     """
-    task, env = scene.config.task, BatchEnv(scene, episodes)
+    task, env = scene.task, BatchEnv(scene, episodes)
     count, decisions = env.num_envs, int(np.ceil(duration / task.ctrl_dt - 1e-9))
     steps = decisions * task.sim_steps
     rollout = Rollout(
@@ -269,6 +269,6 @@ def run_suite(
       EvaluationError: if there are no scenarios or no time, or too much for the memory.
       SuiteError: as `draw_suite`.
     """
-    check_fits(scene.config.task, scenarios, duration, scene.model.nq if record else 0)
-    episodes = draw_suite(scene.config, suite, scenarios, duration, seed)
+    check_fits(scene.task, scenarios, duration, scene.model.nq if record else 0)
+    episodes = draw_suite(scene.task, scene.robot, suite, scenarios, duration, seed)
     return roll_out(scene, controller, episodes, duration, record, progress)

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_balance.config import Config, RandomizationConfig, TaskConfig
+from mjx_balance.config import RandomizationConfig, TaskConfig
 from mjx_balance.envs.batch import Episodes
 from mjx_balance.errors import InputError
-from mjx_balance.robots.catalogue import find_robot
+from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import authority, greatest_incline, scale_ranges
 from mjx_balance.task import tilt
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
@@ -83,7 +83,9 @@ def check_seed(seed: int) -> None:
         raise SuiteError(f"seed is {seed}; it must not be negative")
 
 
-def draw_suite(config: Config, suite: str, scenarios: int, duration: float, seed: int) -> Episodes:
+def draw_suite(
+    task: TaskConfig, robot: Robot, suite: str, scenarios: int, duration: float, seed: int
+) -> Episodes:
     """Draws a suite's episodes, each of `duration` s.
 
     Scenario k of a seed is the same however many are drawn. Scenario, sensor noise and pushes come
@@ -96,7 +98,7 @@ def draw_suite(config: Config, suite: str, scenarios: int, duration: float, seed
     if suite not in SUITES:
         raise SuiteError(f"unknown suite {suite!r}; known suites: {', '.join(SUITES)}")
     check_seed(seed)
-    chosen, task, robot = SUITES[suite], config.task, find_robot(config.robot)
+    chosen = SUITES[suite]
     count = tilt.num_targets(task, duration)
     rngs = [np.random.default_rng((seed, k)) for k in range(scenarios)]
     uniform = np.asarray([rng.uniform(size=(count, 2)) for rng in rngs])

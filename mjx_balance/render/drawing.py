@@ -22,10 +22,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_balance.config import Config, from_dict, to_dict
+from mjx_balance.config import TaskConfig, from_dict, to_dict
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.files.text import MESSAGE, shorten
-from mjx_balance.sim.scene import build_model
+from mjx_balance.sim.scene import Scene, build_model
 
 FPS = 25
 VIDEO_SIZE = (960, 544)
@@ -39,12 +39,12 @@ class RenderError(RuntimeError):
     """This machine cannot draw pictures or open a window; the message says why."""
 
 
-def write(path: Path, config: Config, qpos: np.ndarray) -> None:
+def write(path: Path, scene: Scene, qpos: np.ndarray) -> None:
     """Draws the first state to a `.png` file, or all states to a video, atomically.
 
     Args:
       path: file to write; any suffix but `.png` makes a video, at real speed.
-      config: defines the scene and the time step.
+      scene: robot, board and time step.
       qpos: (steps, nq), one state per physics step.
 
     Raises:
@@ -52,15 +52,15 @@ def write(path: Path, config: Config, qpos: np.ndarray) -> None:
     """
     import imageio.v2 as imageio
 
-    is_picture, stride = path.suffix == ".png", frame_stride(config)
-    painter = Painter(config, PICTURE_SIZE if is_picture else VIDEO_SIZE)
+    is_picture, stride = path.suffix == ".png", frame_stride(scene.task)
+    painter = Painter(scene, PICTURE_SIZE if is_picture else VIDEO_SIZE)
     try:
         with contextlib.closing(painter), tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / f"drawn{path.suffix}"
             if is_picture:
                 imageio.imwrite(file, painter.draw(qpos[0]))
             else:
-                fps = 1 / (stride * config.task.sim_dt)
+                fps = 1 / (stride * scene.task.sim_dt)
                 with imageio.get_writer(file, fps=fps, quality=8) as writer:
                     for state in qpos[::stride]:
                         writer.append_data(painter.draw(state))
@@ -73,14 +73,15 @@ def write(path: Path, config: Config, qpos: np.ndarray) -> None:
 class Painter:
     """Draws states one by one in a child process, which runs until `close`."""
 
-    def __init__(self, config: Config, size: tuple[int, int] = VIDEO_SIZE):
-        """Starts the process, for pictures of the config's scene; `size` is (width, height).
+    def __init__(self, scene: Scene, size: tuple[int, int] = VIDEO_SIZE):
+        """Starts the process, for pictures of the scene; `size` is (width, height).
 
         Raises:
           RenderError: if no OpenGL backend works here.
         """
         self._size, reason = size, ""
-        header = json.dumps({"config": to_dict(config), "size": size})
+        where = {"task": to_dict(scene.task), "robot": scene.robot_source}
+        header = json.dumps(where | {"size": size})
         for backend in _backends():
             self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 closed by _end
             pipe = subprocess.PIPE
@@ -132,7 +133,7 @@ class Painter:
 class Window:
     """MuJoCo's viewer; plays states at real speed."""
 
-    def __init__(self, config: Config, on_key: Callable[[int], None] | None = None):
+    def __init__(self, scene: Scene, on_key: Callable[[int], None] | None = None):
         """Opens the window; `on_key` is called with the GLFW code of every key that is pressed.
 
         Raises:
@@ -141,9 +142,9 @@ class Window:
         _check_display()
         import mujoco.viewer
 
-        self._stride = frame_stride(config)
-        self._pause = self._stride * config.task.sim_dt
-        self._model = build_model(config, visual=True)
+        self._stride = frame_stride(scene.task)
+        self._pause = self._stride * scene.task.sim_dt
+        self._model = build_model(scene.task, scene.robot_source, visual=True)
         self._data = mujoco.MjData(self._model)
         try:
             self._viewer = mujoco.viewer.launch_passive(
@@ -192,9 +193,9 @@ class Window:
         self._viewer.close()
 
 
-def frame_stride(config: Config) -> int:
+def frame_stride(task: TaskConfig) -> int:
     """Physics steps per picture, for about `FPS` pictures a second."""
-    return max(1, round(1 / (FPS * config.task.sim_dt)))
+    return max(1, round(1 / (FPS * task.sim_dt)))
 
 
 def _check_display() -> None:
@@ -235,7 +236,7 @@ def _serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keeps prints of libraries out of the pipe
     states = sys.stdin.buffer
     header = json.loads(states.readline())
-    model = build_model(from_dict(Config, header["config"]), visual=True)
+    model = build_model(from_dict(TaskConfig, header["task"]), header["robot"], visual=True)
     data = mujoco.MjData(model)
     width, height = header["size"]
     with mujoco.Renderer(model, height, width) as renderer:

@@ -149,7 +149,7 @@ def video(policy: Policy) -> str:
     assert rollout.qpos is not None
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "video.mp4"
-        render.write(file, policy.config, rollout.qpos[0])
+        render.write(file, policy_scene(policy), rollout.qpos[0])
         return base64.b64encode(file.read_bytes()).decode()
 
 

@@ -1,13 +1,13 @@
 """Domain randomisation of a compiled model: payload, friction and servo gains."""
 
-import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
-from mjx_balance.sim.scene import ROBOT, Scene
+from mjx_balance.sim.scene import Scene
 from mjx_balance.task import Array
 from mjx_balance.task.randomization import DomainParams
 
@@ -19,26 +19,18 @@ def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
     """The model's fields under domain parameters, for `mjx.Model.replace` or `Batch.expand`.
 
     The payload is a point mass; its products of inertia about the trunk's principal axes are
-    left out.
-
-    Args:
-      scene: the nominal model.
-      params: of one env or scenario, or of a batch (...).
-
-    Returns:
-      Field name -> (..., *shape of the field).
+    left out. Fields have the leading axes of the parameters.
     """
-    model, xp = scene.model, params.payload.__array_namespace__()
-    trunk = model.body(f"{ROBOT}{scene.robot.trunk}").id
+    model, trunk, xp = scene.model, scene.trunk, params.payload.__array_namespace__()
+    legs = scene.leg_ctrl.ravel()
     load, at = params.payload[..., None], params.payload_at
     mass, centre = model.body_mass[trunk], model.body_ipos[trunk]
     moved = (mass * centre + load * at) / (mass + load)
     arm = (at - centre) @ _principal(model, trunk)
     spread = xp.sum(arm**2, axis=-1, keepdims=True) - arm**2
     inertia = model.body_inertia[trunk] + mass * load / (mass + load) * spread
-    gain = params.gain[..., None]
     friction = params.friction[..., None, None] * np.ones((model.npair, 2))
-    stiffness = model.actuator_gainprm[scene.leg_ctrl.ravel(), 0] * gain
+    stiffness = model.actuator_gainprm[legs, 0] * params.gain[..., None]
 
     def put(field: np.ndarray, where: tuple[Any, ...], value: Array) -> Array:
         base = xp.zeros((*value.shape[: params.payload.ndim], *field.shape)) + field
@@ -47,7 +39,6 @@ def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
         base[(..., *where)] = value
         return base
 
-    legs = scene.leg_ctrl.ravel()
     of_bodies, of_dofs = inverse_weights(scene, (mass + load)[..., 0], moved, inertia)
     return {
         "body_mass": put(model.body_mass, (trunk,), (mass + load)[..., 0]),
@@ -61,26 +52,24 @@ def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
     }
 
 
-def _principal(model: mujoco.MjModel, body: int) -> np.ndarray:
-    """(3, 3) a body's principal axes, as columns, in its frame."""
+def _principal(model: mujoco.MjModel, body: int) -> Float[np.ndarray, "3 3"]:
+    """A body's principal axes, as columns, in its frame."""
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, model.body_iquat[body])
     return axes.reshape(3, 3)
 
 
-@dataclasses.dataclass(frozen=True)
-class _AtRest:
+class _AtRest(NamedTuple):
     """Jacobians and inertia of the nominal model at qpos0."""
 
-    trunk: int
-    inertia: np.ndarray
-    """(nv, nv) without the trunk's part."""
-    centres: np.ndarray
-    """(nbody, 3, nv) of the bodies' centres of mass; the trunk's: of its frame's origin."""
-    turns: np.ndarray
-    """(nbody, 3, nv) rotational."""
-    trunk_turns: np.ndarray
-    """(3, nv) the trunk's, about its principal axes."""
+    inertia: Float[np.ndarray, "nv nv"]
+    """Without the trunk's part."""
+    centres: Float[np.ndarray, "nbody 3 nv"]
+    """Of the bodies' centres of mass; the trunk's: of its frame's origin."""
+    turns: Float[np.ndarray, "nbody 3 nv"]
+    """Rotational."""
+    trunk_turns: Float[np.ndarray, "3 nv"]
+    """The trunk's, about its principal axes."""
 
 
 @functools.lru_cache(maxsize=8)
@@ -99,19 +88,24 @@ def _at_rest(model: mujoco.MjModel, trunk: int) -> _AtRest:
         centres[trunk], principal, model.body_mass[trunk], model.body_inertia[trunk]
     )
     mujoco.mj_jacBody(model, data, centres[trunk], None, trunk)
-    return _AtRest(trunk, whole - part, centres, turns, principal)
+    return _AtRest(whole - part, centres, turns, principal)
 
 
-def _spatial_inertia(centre: Array, turn: Array, mass: Array, inertia: Array) -> Array:
-    """Joint-space inertia (..., nv, nv) of a body, `turn` about its principal axes."""
+def _spatial_inertia(
+    centre: Array, turn: Array, mass: Array, inertia: Array
+) -> Float[Array, "*batch nv nv"]:
+    """Joint-space inertia of a body, `turn` about its principal axes."""
     xp = centre.__array_namespace__()
     moving = xp.asarray(mass)[..., None, None] * (xp.matrix_transpose(centre) @ centre)
     return moving + turn.T @ (xp.asarray(inertia)[..., None] * turn)
 
 
 def inverse_weights(
-    scene: Scene, mass: Array, centre: Array, inertia: Array
-) -> tuple[Array, Array]:
+    scene: Scene,
+    mass: Float[Array, "*batch"],
+    centre: Float[Array, "*batch 3"],
+    inertia: Float[Array, "*batch 3"],
+) -> tuple[Float[Array, "*batch nbody 2"], Float[Array, "*batch nv"]]:
     """Body and dof inverse weights, which scale the constraints, for another trunk.
 
     What `mj_setConst` computes: the mean diagonal of J M^-1 J^T at qpos0, of the centre of
@@ -120,19 +114,15 @@ def inverse_weights(
 
     Args:
       scene: the nominal model.
-      mass: (...) of the trunk, kg.
-      centre: (..., 3) its centre of mass in its frame, m.
-      inertia: (..., 3) its principal inertia, kg m^2.
-
-    Returns:
-      body_invweight0 (..., nbody, 2) and dof_invweight0 (..., nv).
+      mass: of the trunk, kg.
+      centre: its centre of mass in its frame, m.
+      inertia: its principal inertia, kg m^2.
     """
-    model, xp = scene.model, mass.__array_namespace__()
-    rest = _at_rest(model, model.body(f"{ROBOT}{scene.robot.trunk}").id)
-    turn = rest.turns[rest.trunk]
+    model, trunk, xp = scene.model, scene.trunk, mass.__array_namespace__()
+    rest = _at_rest(model, trunk)
     # v(centre) = v(origin) + omega x centre
-    lever = -xp.cross(centre[..., None, :], turn.T, axis=-1)
-    moved = rest.centres[rest.trunk] + xp.matrix_transpose(lever)
+    lever = -xp.cross(centre[..., None, :], rest.turns[trunk].T, axis=-1)
+    moved = rest.centres[trunk] + xp.matrix_transpose(lever)
     whole = rest.inertia + _spatial_inertia(moved, rest.trunk_turns, mass, inertia)
     inverse = xp.linalg.inv(whole)
 
@@ -140,15 +130,15 @@ def inverse_weights(
         product = xp.einsum("...iv,...vw,...iw->...i", jacobian, inverse[..., None, :, :], jacobian)
         return product.mean(axis=-1)
 
-    others = np.arange(model.nbody) != rest.trunk
+    others = np.arange(model.nbody) != trunk
     centres = xp.where(others[:, None, None], rest.centres, moved[..., None, :, :])
     weights = xp.stack((mean_diagonal(centres), mean_diagonal(rest.turns)), axis=-1)
     diagonal = xp.diagonal(inverse, axis1=-2, axis2=-1)
     return weights, diagonal @ _joint_means(model)
 
 
-def _joint_means(model: mujoco.MjModel) -> np.ndarray:
-    """(nv, nv) matrix that averages over the three dofs of a free joint's halves."""
+def _joint_means(model: mujoco.MjModel) -> Float[np.ndarray, "nv nv"]:
+    """Averages over the three dofs of a free joint's halves."""
     means = np.eye(model.nv)
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
         for half in range(2):

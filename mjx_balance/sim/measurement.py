@@ -3,6 +3,8 @@
 To measure more, name MuJoCo's field in `RECORDED` and add an entry to `Motion` and to `measure`.
 """
 
+from jaxtyping import Float
+
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task import Array
 from mjx_balance.task.attitude import body_tilt
@@ -12,17 +14,10 @@ RECORDED = ("qpos", "sensordata")
 """Fields of MuJoCo's data that engines record at every physics step."""
 
 
-def measure(scene: Scene, qpos: Array, sensordata: Array) -> Motion:
-    """Measures recorded states.
-
-    Args:
-      scene: addresses in the fields.
-      qpos: (..., nq) after each physics step.
-      sensordata: (..., nsensordata), of the state before it.
-
-    Returns:
-      Motion with the leading dimensions of the fields.
-    """
+def measure(
+    scene: Scene, qpos: Float[Array, "*batch nq"], sensordata: Float[Array, "*batch nsensordata"]
+) -> Motion:
+    """Measures qpos after each physics step, and sensordata of the state before it."""
     return Motion(
         imu=sensordata[..., scene.imu],
         tilt=body_tilt(qpos[..., scene.trunk_quat]),

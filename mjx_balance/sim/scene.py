@@ -1,19 +1,14 @@
-"""Builds the MuJoCo model from `scenes/*.xml` and the config; finds the standing state."""
+"""Builds the MuJoCo model from `scenes/*.xml`, a task and a robot; finds the standing state."""
 
 import dataclasses
 import hashlib
 
 import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 
-from mjx_balance.config import Config, ConfigError
-from mjx_balance.robots.build import (
-    ACCELEROMETER,
-    BOARD_SIZE,
-    GYRO,
-    VISUAL_GROUP,
-    scene_dir,
-)
+from mjx_balance.config import Config, ConfigError, TaskConfig
+from mjx_balance.robots.build import ACCELEROMETER, BOARD_SIZE, GYRO, VISUAL_GROUP, scene_dir
 from mjx_balance.robots.catalogue import Robot, find_robot, robot_file, robot_spec
 from mjx_balance.robots.limits import check_robot
 from mjx_balance.task import Array
@@ -31,45 +26,51 @@ SETTLE_ROUNDS = 4
 class Stance:
     """The settled standing state, the start of every episode."""
 
-    qpos: np.ndarray
-    """(nq,)"""
-    qvel: np.ndarray
-    """(nv,)"""
-    qacc_warmstart: np.ndarray
-    """(nv,)"""
-    leg_trim: np.ndarray
-    """(legs, 3) rad added to the joint angles, so that the loaded servos stand where
-    they are told: the robot's own weight would otherwise bend the legs by millimetres."""
-    imu: np.ndarray
-    """(6,) gyro in rad/s and accelerometer in m/s^2 at rest."""
+    qpos: Float[np.ndarray, " nq"]
+    qvel: Float[np.ndarray, " nv"]
+    qacc_warmstart: Float[np.ndarray, " nv"]
+    leg_trim: Float[np.ndarray, "legs 3"]
+    """Added to the joint angles so that the servos reach them under load, rad: the robot's own
+    weight would otherwise bend the legs by millimetres."""
+    imu: Float[np.ndarray, "6"]
+    """Gyro in rad/s and accelerometer in m/s^2 at rest."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
+class Layout:
     """A compiled model and the addresses everything else needs, looked up once by name."""
 
-    config: Config
-    """What it was built from."""
+    task: TaskConfig
     robot: Robot
+    robot_source: str
+    """As `Config.robot`."""
     model: mujoco.MjModel
-    leg_qpos: np.ndarray
-    """(legs, 3) addresses of the leg joints in qpos."""
-    leg_ctrl: np.ndarray
-    """(legs, 3) addresses of the leg servos in ctrl."""
-    board_qpos: np.ndarray
-    """(2,) addresses of the board hinges, X and Y, in qpos."""
-    board_ctrl: np.ndarray
-    """(2,) addresses of the board servos in ctrl."""
-    trunk_quat: np.ndarray
-    """(4,) addresses of the trunk's orientation in qpos."""
-    trunk_velocity: np.ndarray
-    """(2,) addresses of the trunk's velocity along the world's x and y in qvel."""
-    imu: np.ndarray
-    """(6,) addresses of gyro and accelerometer in sensordata."""
+    trunk: int
+    """Id of the trunk's body."""
+    leg_qpos: Int[np.ndarray, "legs 3"]
+    """Of the leg joints in qpos."""
+    leg_ctrl: Int[np.ndarray, "legs 3"]
+    """Of the leg servos in ctrl."""
+    board_qpos: Int[np.ndarray, "2"]
+    """Of the board hinges, X and Y, in qpos."""
+    board_ctrl: Int[np.ndarray, "2"]
+    """Of the board servos in ctrl."""
+    trunk_quat: Int[np.ndarray, "4"]
+    """Of the trunk's orientation in qpos."""
+    trunk_velocity: Int[np.ndarray, "2"]
+    """Of the trunk's velocity along the world's x and y in qvel."""
+    imu: Int[np.ndarray, "6"]
+    """Of gyro and accelerometer in sensordata."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene(Layout):
+    """A model, its addresses, and the state in which episodes start."""
+
     stance: Stance
 
-    def ctrl(self, targets: Targets) -> Array:
-        """Servo targets (..., sim_steps, nu) in the model's order, rad."""
+    def ctrl(self, targets: Targets) -> Float[Array, "*batch sim_steps nu"]:
+        """Servo targets in the model's order, rad."""
         joints = targets.joints + self.stance.leg_trim.astype(targets.joints.dtype)
         xp = joints.__array_namespace__()
         flat = (targets.board, joints.reshape(*joints.shape[:-2], -1))
@@ -82,29 +83,29 @@ class Scene:
         return scene_hash(self.model)
 
 
-def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
+def build_model(task: TaskConfig, robot_source: str, visual: bool = False) -> mujoco.MjModel:
     """Assembles and compiles stage, board and robot.
 
     Args:
-      config: gives the time step, the standing height and the foot friction.
-      visual: whether to keep the geoms that are only looked at; without them
-        MJX has a sixth of the geoms to move.
+      task: time step and standing height.
+      robot_source: as `Config.robot`.
+      visual: whether to keep the visual geoms; without them MJX has a sixth of the geoms to move.
 
     Raises:
       ConfigError: if the robot's file asks for a board that its feet do not fit on.
     """
-    robot = find_robot(config.robot)
+    robot = find_robot(robot_source)
     stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
     for looked in (*stage.cameras, *stage.worldbody.geoms):  # from as far as it is large
         looked.pos = looked.pos * robot.size_scale
-    height = config.task.body_height
-    body = robot_spec(config.robot, visual)
+    body = robot_spec(robot_source, visual)
     size = body.numeric(BOARD_SIZE)
     board = _board(robot, None if size is None else float(size.data[0]))
     stage.attach(board, prefix=BOARD, frame=stage.worldbody.add_frame())
     for name in (x for x in dir(stage.option) if not x.startswith("_")):
         setattr(body.option, name, getattr(stage.option, name))
-    stage.attach(body, prefix=ROBOT, frame=stage.worldbody.add_frame(pos=[0, 0, height]))
+    frame = stage.worldbody.add_frame(pos=[0, 0, task.body_height])
+    stage.attach(body, prefix=ROBOT, frame=frame)
     friction = robot.foot_friction
     for leg in robot.legs:
         stage.add_pair(
@@ -115,7 +116,7 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
             friction=[friction, friction, 0.005, 0.0001, 0.0001],
             solref=[CONTACT_TIME, 1],
         )
-    stage.option.timestep = config.task.sim_dt
+    stage.option.timestep = task.sim_dt
     if not visual:
         for geom in [g for g in stage.geoms if g.group == VISUAL_GROUP]:
             stage.delete(geom)
@@ -123,15 +124,7 @@ def build_model(config: Config, visual: bool = False) -> mujoco.MjModel:
 
 
 def _board(robot: Robot, size: float | None) -> mujoco.MjSpec:
-    """The board, as large, heavy and stiff for this robot as ours is for our own.
-
-    Args:
-      robot: gives mass and size.
-      size: length of the board, m; none: by the robot's.
-
-    Raises:
-      ConfigError: if its feet do not fit on a board of that size.
-    """
+    """The board, as large, heavy and stiff for this robot as ours is for our own; `size` in m."""
     board = mujoco.MjSpec.from_file(str(scene_dir() / "board.xml"))
     longer, heavier = robot.size_scale, robot.mass_scale
     if size is not None:
@@ -167,102 +160,93 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     """
     robot = find_robot(config.robot)
     check_robot(config, robot)
-    model = build_model(config, visual)
+    model = build_model(config.task, config.robot, visual)
     names = [[f"{ROBOT}{joint}" for joint in leg.joints] for leg in robot.legs]
-    leg_qpos = np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names])
-    leg_ctrl = np.asarray([[model.actuator(n).id for n in leg] for leg in names])
     board = [f"{BOARD}board_{axis}" for axis in "xy"]
-    joint = model.joint(int(model.body(f"{ROBOT}{robot.trunk}").jntadr[0]))
-    root = joint.qposadr[0]
+    trunk = model.body(f"{ROBOT}{robot.trunk}")
+    root = model.joint(int(trunk.jntadr[0]))
     sensors = [model.sensor(f"{ROBOT}{name}") for name in (GYRO, ACCELEROMETER)]
-    imu = np.concatenate([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in sensors])
-    return Scene(
-        config=config,
+    layout = Layout(
+        task=config.task,
         robot=robot,
+        robot_source=config.robot,
         model=model,
-        leg_qpos=leg_qpos,
-        leg_ctrl=leg_ctrl,
+        trunk=trunk.id,
+        leg_qpos=np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names]),
+        leg_ctrl=np.asarray([[model.actuator(n).id for n in leg] for leg in names]),
         board_qpos=np.asarray([model.joint(n).qposadr[0] for n in board]),
         board_ctrl=np.asarray([model.actuator(n).id for n in board]),
-        trunk_quat=np.arange(root + 3, root + 7),
-        trunk_velocity=joint.dofadr[0] + np.arange(2),
-        imu=imu,
-        stance=settle(config, robot, model, leg_qpos, leg_ctrl, root, imu),
+        trunk_quat=root.qposadr[0] + np.arange(3, 7),
+        trunk_velocity=root.dofadr[0] + np.arange(2),
+        imu=np.concatenate([s.adr[0] + np.arange(s.dim[0]) for s in sensors]),
     )
+    return Scene(**vars(layout), stance=_settle(layout))
 
 
-def settle(
-    config: Config,
-    robot: Robot,
-    model: mujoco.MjModel,
-    leg_qpos: np.ndarray,
-    leg_ctrl: np.ndarray,
-    root: int,
-    imu: np.ndarray,
-) -> Stance:
-    """Lets the robot come to rest on the level board, joints where they were told to be.
+def _settle(layout: Layout) -> Stance:
+    """Lets the robot come to rest on the level board with its joints at their targets.
 
     A position servo under load stands off its target. Each round adds that error
     to the trim, as the integral term of a servo would.
     """
-    task = config.task
-    wanted = joint_angles(robot, np.full(len(robot.legs), task.body_height))
-    trim = np.zeros_like(wanted)
+    model, legs, height = layout.model, layout.leg_qpos, layout.task.body_height
+    servos, root = layout.leg_ctrl, layout.trunk_quat[0] - 3
+    angles = joint_angles(layout.robot, np.full(len(legs), height))
+    trim = np.zeros_like(angles)
     data = mujoco.MjData(model)
-    data.qpos[root : root + 7] = (0, 0, task.body_height, 1, 0, 0, 0)
-    data.qpos[leg_qpos] = wanted
+    data.qpos[root : root + 7] = (0, 0, height, 1, 0, 0, 0)
+    data.qpos[legs] = angles
     for _ in range(SETTLE_ROUNDS):
-        data.ctrl[leg_ctrl] = wanted + trim
+        data.ctrl[servos] = angles + trim
         mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
-        trim = trim + wanted - data.qpos[leg_qpos]
-    data.ctrl[leg_ctrl] = wanted + trim
+        trim = trim + angles - data.qpos[legs]
+    data.ctrl[servos] = angles + trim
     data.qpos[root : root + 2] = 0
     mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
     upright = np.abs(data.qpos[root + 4 : root + 6]).max() < 0.01
     if not (upright and np.abs(data.qvel).max() < 0.01):
-        share = np.abs(data.actuator_force[leg_ctrl]) / model.actuator_forcerange[leg_ctrl, 1]
+        raise ConfigError(_why_unsettled(layout, data))
+    state = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
+    return Stance(*state, trim, data.sensordata[layout.imu].copy())
+
+
+def _why_unsettled(layout: Layout, data: mujoco.MjData) -> str:
+    """Says that the robot does not stand, and why, as far as one can tell."""
+    robot, height = layout.robot, layout.task.body_height
+    limits = layout.model.actuator_forcerange[layout.leg_ctrl, 1]
+    share = np.abs(data.actuator_force[layout.leg_ctrl]) / limits
+    if share.max() > 0.99:
         leg, joint = np.unravel_index(np.argmax(share), share.shape)
-        if share.max() > 0.99:
-            raise ConfigError(
-                f"robot {robot.name} weighs {robot.total_mass:.1f} kg, too much for its servos: "
-                f"{robot.legs[leg].joints[joint]!r} needs more than its "
-                f"{model.actuator_forcerange[leg_ctrl[leg, joint], 1]:g} N m to stand at "
-                f"body_height {task.body_height} m"
-            )
-        raise ConfigError(
-            f"robot {robot.name} does not stand still at body_height {task.body_height} m with "
-            f"servo_stiffness {robot.servo_stiffness:g} N m/rad: {_why(config, robot, model, root)}"
+        return (
+            f"robot {robot.name} weighs {robot.total_mass:.1f} kg, too much for its servos: "
+            f"{robot.legs[leg].joints[joint]!r} needs more than its {limits[leg, joint]:g} N m to "
+            f"stand at body_height {height} m"
         )
-    return Stance(
-        qpos=data.qpos.copy(),
-        qvel=data.qvel.copy(),
-        qacc_warmstart=data.qacc_warmstart.copy(),
-        leg_trim=trim,
-        imu=data.sensordata[imu].copy(),
+    return (
+        f"robot {robot.name} does not stand still at body_height {height} m with "
+        f"servo_stiffness {robot.servo_stiffness:g} N m/rad: {_why_unbalanced(layout)}"
     )
 
 
-def _why(config: Config, robot: Robot, model: mujoco.MjModel, root: int) -> str:
-    """What keeps a robot from standing, as far as one can tell."""
-    data = mujoco.MjData(model)
-    data.qpos[root + 3] = 1
-    mujoco.mj_forward(model, data)
-    trunk = model.body(f"{ROBOT}{robot.trunk}").id
-    for axis, centre, one, other in zip(
-        "xy", data.subtree_com[trunk], ("ahead", "left"), ("behind", "right"), strict=False
-    ):
-        feet = robot.each(axis)
-        if not feet.min() < centre < feet.max():
-            way = one if centre > feet.max() else other
+def _why_unbalanced(layout: Layout) -> str:
+    """Where the centre of mass is if it is not above the feet; else what to leave to the rules."""
+    data, robot = mujoco.MjData(layout.model), layout.robot
+    data.qpos[layout.trunk_quat[0]] = 1
+    mujoco.mj_forward(layout.model, data)
+    sides = ("x", "ahead", "behind"), ("y", "left", "right")
+    for (axis, above, below), at in zip(sides, data.subtree_com[layout.trunk], strict=False):
+        least, most = robot.each(axis).min(), robot.each(axis).max()
+        if not least < at < most:
             return (
-                f"its centre of mass is {1000 * abs(centre):.0f} mm {way} of the trunk's origin, "
-                f"and its feet stand from {1000 * feet.min():.0f} to {1000 * feet.max():.0f} mm"
+                f"its centre of mass is {1000 * abs(at):.0f} mm {above if at > most else below} of "
+                f"the trunk's origin, and its feet stand from {1000 * least:.0f} to "
+                f"{1000 * most:.0f} mm"
             )
-    file = robot_file(config.robot)
+    file = robot_file(layout.robot_source)
     names = ("servo_stiffness", "servo_damping", "servo_armature", "body_height")
-    said = [name for name in names if getattr(file, name) is not None]
-    if said:
-        return f"leave out {', '.join(said)} of its file, and the rules give others"
+    given = [name for name in names if getattr(file, name) is not None]
+    if given:
+        return f"leave out {', '.join(given)} of its file, and the rules give others"
     return "neither its centre of mass nor its file says why; look at its picture"
 
 

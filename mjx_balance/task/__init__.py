@@ -2,10 +2,10 @@
 
 Every function takes its array library from its arguments, so that the same code
 runs on NumPy arrays (plain-MuJoCo evaluation) and on JAX arrays (MJX training).
-None of them knows an engine. Leading dimensions, written `...`, are batches.
+None of them knows an engine. Annotations give shapes; `*batch` and `...` are any leading axes.
 """
 
 from typing import Any, TypeAlias
 
 Array: TypeAlias = Any
-"""A NumPy or JAX array; functions say the shape and unit they expect."""
+"""A NumPy or JAX array, as in `Float[Array, "*batch legs"]`."""

@@ -1,6 +1,7 @@
 """The 21 x 21 actions of paper Eq. 3, or any height change up to theirs."""
 
 import numpy as np
+from jaxtyping import Float, Float32, Int
 
 from mjx_balance.config import ConfigError, TaskConfig
 from mjx_balance.files.text import quote
@@ -18,56 +19,32 @@ def check_action(kind: str) -> str:
     return kind
 
 
-def action_table(task: TaskConfig) -> np.ndarray:
-    """Height changes of every action: a_x varies slowest.
-
-    Returns:
-      (action_levels**2, 2) a_x and a_y, m, float32.
-    """
+def action_table(task: TaskConfig) -> Float32[np.ndarray, "actions 2"]:
+    """Height changes a_x and a_y of every action, m; a_x varies slowest."""
     n = np.arange(task.action_levels)
     level = -task.action_max + 2 * task.action_max * n / (task.action_levels - 1)
     a_x, a_y = np.meshgrid(level, level, indexing="ij")
     return np.stack((a_x.ravel(), a_y.ravel()), axis=-1).astype(np.float32)
 
 
-def nearest_action(task: TaskConfig, change: np.ndarray) -> np.ndarray:
-    """Index of the action closest to a wanted height change.
-
-    Args:
-      task: the action grid.
-      change: (..., 2) a_x and a_y, m, of any size.
-
-    Returns:
-      (...) indices into `action_table`.
-    """
+def nearest_action(task: TaskConfig, change: Float[Array, "*batch 2"]) -> Int[Array, "*batch"]:
+    """Index into `action_table` of the action closest to a height change of any size, m."""
     step = 2 * task.action_max / (task.action_levels - 1)
     level = np.clip(np.rint((change + task.action_max) / step), 0, task.action_levels - 1)
     return (level[..., 0] * task.action_levels + level[..., 1]).astype(int)
 
 
-def leg_signs(robot: Robot) -> np.ndarray:
-    """Which way each foot goes: left +a_x, right -a_x, front +a_y, hind -a_y.
-
-    Returns:
-      (2, legs) of +-1, float32.
-    """
+def leg_signs(robot: Robot) -> Float32[np.ndarray, "2 legs"]:
+    """Which way each foot goes, +-1: left +a_x, right -a_x; front +a_y, hind -a_y."""
     return np.where((robot.left, robot.front), np.float32(1), np.float32(-1))
 
 
-def apply_action(task: TaskConfig, robot: Robot, heights: Array, change: Array) -> Array:
-    """Adds one action to the foot heights.
+def apply_action(
+    robot: Robot, heights: Float[Array, "*batch legs"], change: Float[Array, "*batch 2"]
+) -> Float[Array, "*batch legs"]:
+    """Adds an action to the commanded foot heights, m, within the legs' reach.
 
     Raising the left side by a_x means longer left legs and shorter right ones.
-    The heights stay within the legs' reach.
-
-    Args:
-      task: names the units.
-      robot: sides and reach of the legs.
-      heights: (..., legs) commanded foot heights, m.
-      change: (..., 2) a_x and a_y, m.
-
-    Returns:
-      (..., legs) commanded foot heights, m.
     """
     xp = heights.__array_namespace__()
     signs = leg_signs(robot).astype(heights.dtype)

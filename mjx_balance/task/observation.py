@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Float32, Int
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.robots.catalogue import Robot
@@ -17,12 +18,10 @@ from mjx_balance.task import Array
 
 
 class Mirror(NamedTuple):
-    """What an input is in the left-right mirror: `sign` times another input."""
+    """What an input is in the left-right mirror: `sign`, +-1, times the input named `row`."""
 
     row: str
-    """Name of that input."""
     sign: int
-    """1 or -1."""
 
 
 class Row(NamedTuple):
@@ -48,13 +47,12 @@ class Row(NamedTuple):
 class Signals(NamedTuple):
     """Samples of all sensors up to a decision, the newest last."""
 
-    heights: Array
-    """(..., 1, legs) measured foot heights, m."""
-    commands: Array
-    """(..., n, legs) commanded foot heights, a sample per decision, m."""
-    imu: Array
-    """(..., n, 6) gyro x, y, z and accelerometer x, y, z, a sample per physics step, rad/s and
-    m/s^2."""
+    heights: Float[Array, "*batch 1 legs"]
+    """Measured foot heights, m."""
+    commands: Float[Array, "*batch decisions legs"]
+    """Commanded foot heights, a sample per decision, m."""
+    imu: Float[Array, "*batch samples 6"]
+    """Gyro x, y, z and accelerometer x, y, z, a sample per physics step, rad/s and m/s^2."""
 
 
 class Sensor(NamedTuple):
@@ -83,45 +81,34 @@ def input_rows(task: TaskConfig, robot: Robot) -> tuple[Row, ...]:
     Measured heights, commanded heights lag by lag, then gyro x and y and accelerometer x and y at
     every lag (paper Eq. 2). With `task.imu_mean` = 5, `V_x,t-10` is the mean of the samples that
     are 10 to 14 steps old.
-
-    Args:
-      task: lags, window, scales, standing height.
-      robot: names and sides of the legs.
     """
     height, scale, mean = task.body_height, task.height_scale, task.imu_mean
-    rows = _leg_rows(robot, "H", "height", height, scale)
+    rows = _leg_rows(robot, "H_{leg}", "height", height, scale)
     for lag in task.command_lags:
-        rows += _leg_rows(robot, "C", "command", height, scale, lag=lag)
-    rows += _axis_rows("V", "gyro", task.gyro_lags, mean, task.gyro_scale, TURN_SIGNS)
-    rows += _axis_rows(
-        "Acc", "accelerometer", task.accel_lags, mean, task.accel_scale, MOTION_SIGNS
-    )
+        rows += _leg_rows(robot, "C_{leg},d-{lag}", "command", height, scale, lag)
+    gyro = task.gyro_lags, mean, task.gyro_scale
+    accelerometer = task.accel_lags, mean, task.accel_scale
+    rows += _axis_rows("V_{axis},t-{lag}", "gyro", *gyro, TURN_SIGNS)
+    rows += _axis_rows("Acc_{axis},t-{lag}", "accelerometer", *accelerometer, MOTION_SIGNS)
     return tuple(rows)
 
 
 def _leg_rows(
-    robot: Robot,
-    symbol: str,
-    sensor: str,
-    offset: float,
-    scale: float,
-    sign: int = 1,
-    lag: int | None = None,
+    robot: Robot, name: str, sensor: str, offset: float, scale: float, lag: int = 0, sign: int = 1
 ) -> list[Row]:
-    """A row per leg; `sign` is that of the partner leg in the mirror, `lag` one of decisions."""
-    suffix = "" if lag is None else f",d-{lag}"
-    names = [f"{symbol}_{leg.name}{suffix}" for leg in robot.legs]
+    """A row per leg; `sign` is that of the partner leg in the mirror."""
+    names = [name.format(leg=leg.name, lag=lag) for leg in robot.legs]
     sides = list(zip(robot.left, robot.front, strict=True))
     mirrors = [Mirror(names[sides.index((not left, front))], sign) for left, front in sides]
     scale = float(np.float32(scale))
     return [
-        Row(name, sensor, k, lag or 0, 1, offset, scale, mirror)
+        Row(name, sensor, k, lag, 1, offset, scale, mirror)
         for k, (name, mirror) in enumerate(zip(names, mirrors, strict=True))
     ]
 
 
 def _axis_rows(
-    symbol: str,
+    name: str,
     sensor: str,
     lags: Sequence[int],
     window: int,
@@ -130,13 +117,10 @@ def _axis_rows(
     axes: str = "xy",
 ) -> list[Row]:
     """A row per axis and lag; `signs` are those of x, y and z in the mirror."""
-    rows = []
-    for axis in axes:
-        index = "xyz".index(axis)
-        for lag in lags:
-            name, unit = f"{symbol}_{axis},t-{lag}", float(np.float32(scale))
-            mirror = Mirror(name, signs[index])
-            rows.append(Row(name, sensor, index, lag, window, 0.0, unit, mirror))
+    rows, scale = [], float(np.float32(scale))
+    for axis, lag in itertools.product(axes, lags):
+        own, index = name.format(axis=axis, lag=lag), "xyz".index(axis)
+        rows.append(Row(own, sensor, index, lag, window, 0.0, scale, Mirror(own, signs[index])))
     return rows
 
 
@@ -151,16 +135,8 @@ def lookback(rows: Sequence[Row], signal: str) -> int:
     return max(ages, default=1)
 
 
-def observe(rows: tuple[Row, ...], signals: Signals) -> Array:
-    """Builds the scaled observation.
-
-    Args:
-      rows: from `input_rows`.
-      signals: at least `lookback` samples of each.
-
-    Returns:
-      (..., len(rows)), of the type of the IMU's samples.
-    """
+def observe(rows: tuple[Row, ...], signals: Signals) -> Float[Array, "... obs_size"]:
+    """Builds the scaled observation from at least `lookback` samples of each signal."""
     xp = signals.imu.__array_namespace__()
     runs, scale = _compiled(rows)
     inputs = []
@@ -173,19 +149,18 @@ def observe(rows: tuple[Row, ...], signals: Signals) -> Array:
 
 
 class _Run(NamedTuple):
-    """Consecutive rows, n of them, of one signal, offset and window."""
+    """Consecutive rows of one signal, offset and window."""
 
     signal: str
     offset: float
-    ages: np.ndarray
-    """(window, n) of the samples averaged."""
-    channels: np.ndarray
-    """(n,)"""
+    ages: Int[np.ndarray, "window rows"]
+    """Of the samples averaged."""
+    channels: Int[np.ndarray, " rows"]
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(rows: tuple[Row, ...]) -> tuple[list[_Run], np.ndarray]:
-    """The rows as runs, and their scales (n,)."""
+def _compiled(rows: tuple[Row, ...]) -> tuple[list[_Run], Float32[np.ndarray, " obs_size"]]:
+    """The rows as runs, and their scales."""
     runs = []
     for (signal, offset, window), group in itertools.groupby(
         rows, key=lambda row: (SENSORS[row.sensor].signal, row.offset, row.window)
@@ -197,7 +172,9 @@ def _compiled(rows: tuple[Row, ...]) -> tuple[list[_Run], np.ndarray]:
     return runs, np.asarray([row.scale for row in rows], np.float32)
 
 
-def extend_history(history: Array, samples: Array) -> Array:
-    """Appends (..., m, k) samples to a (..., h, k) history and keeps the last h."""
+def extend_history(
+    history: Float[Array, "*batch kept k"], samples: Float[Array, "*batch new k"]
+) -> Float[Array, "*batch kept k"]:
+    """Appends samples to a history and keeps the last ones."""
     xp = history.__array_namespace__()
     return xp.concatenate((history, samples), axis=-2)[..., -history.shape[-2] :, :]

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+from jaxtyping import Bool, Float
+
 from mjx_balance.config import TaskConfig
 from mjx_balance.task import Array
 
@@ -10,12 +12,12 @@ from mjx_balance.task import Array
 class RewardInputs(NamedTuple):
     """What the reward looks at of one decision."""
 
-    tilt_before: Array
-    """(...) body tilt when the decision was taken, deg."""
-    tilt_after: Array
-    """(...) body tilt at its end, deg."""
-    fell: Array
-    """(...) 1 where the body failed on the way, else 0."""
+    tilt_before: Float[Array, "*batch"]
+    """Body tilt when the decision was taken, deg."""
+    tilt_after: Float[Array, "*batch"]
+    """Body tilt at its end, deg."""
+    fell: Float[Array, "*batch"]
+    """1 where the body failed on the way, else 0."""
 
 
 class RewardRow(NamedTuple):
@@ -27,20 +29,20 @@ class RewardRow(NamedTuple):
     weight: float
 
 
-def level(task: TaskConfig, inputs: RewardInputs) -> Array:
+def level(task: TaskConfig, inputs: RewardInputs) -> Float[Array, "..."]:
     """Eq. 4: exp(-sharpness * tilt); a tilt is never negative."""
     xp = inputs.tilt_after.__array_namespace__()
     return xp.exp(-task.reward_sharpness * inputs.tilt_after)
 
 
-def toward(task: TaskConfig, inputs: RewardInputs) -> Array:
+def toward(task: TaskConfig, inputs: RewardInputs) -> Float[Array, "..."]:
     """Fig. 5: tilt lost, over a scale, from -1 to 1."""
     xp = inputs.tilt_after.__array_namespace__()
     gain = inputs.tilt_before - inputs.tilt_after
     return xp.clip(gain / task.reward_toward_scale, -1.0, 1.0)
 
 
-def fail(task: TaskConfig, inputs: RewardInputs) -> Array:
+def fail(task: TaskConfig, inputs: RewardInputs) -> Float[Array, "..."]:
     """1 on a fall."""
     return inputs.fell
 
@@ -54,16 +56,11 @@ def reward_rows(task: TaskConfig) -> tuple[RewardRow, ...]:
     )
 
 
-def reward_terms(task: TaskConfig, inputs: RewardInputs) -> dict[str, Array]:
-    """The weighted terms (...) of one decision by name; the reward is their sum."""
+def reward_terms(task: TaskConfig, inputs: RewardInputs) -> dict[str, Float[Array, "..."]]:
+    """The weighted terms of one decision by name; the reward is their sum."""
     return {row.name: row.weight * row.function(task, inputs) for row in reward_rows(task)}
 
 
-def failed(task: TaskConfig, tilt: Array) -> Array:
-    """True where the body tilts past `fail_tilt`, or is not a number.
-
-    Args:
-      task: the limit.
-      tilt: (...) deg.
-    """
+def failed(task: TaskConfig, tilt: Float[Array, "*batch"]) -> Bool[Array, "*batch"]:
+    """True where the body's tilt, in deg, is above `fail_tilt`, or is not a number."""
     return ~(tilt <= task.fail_tilt)

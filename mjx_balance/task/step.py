@@ -6,21 +6,16 @@ and Gymnasium's envs in NumPy for many envs at once. What is random is drawn out
 draw differently.
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array, kinematics, tilt
 from mjx_balance.task.actions import apply_action
-from mjx_balance.task.observation import (
-    Signals,
-    extend_history,
-    input_rows,
-    lookback,
-    observe,
-)
+from mjx_balance.task.observation import Signals, extend_history, input_rows, lookback, observe
 from mjx_balance.task.pushes import Pushes, push_velocity
 from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.reward import RewardInputs, failed, reward_terms
@@ -32,42 +27,43 @@ DIVERGED = 1e4
 class Memory(NamedTuple):
     """What one decision leaves to the next, besides the state of the physics."""
 
-    heights: Array
-    """(..., legs) foot heights that the legs moved to last, m."""
-    commanded: Array
-    """(..., n, legs) foot heights that the latest actions commanded, the newest
-    last, m; delayed actions stand here before the legs move."""
-    imu: Array
-    """(..., n, 6) latest IMU samples, the newest last, rad/s and m/s^2."""
-    tilt: Array
-    """(...) body tilt of the last reward, deg."""
+    heights: Float[Array, "*batch legs"]
+    """Foot heights that the legs moved to last, m."""
+    commanded: Float[Array, "*batch decisions legs"]
+    """Foot heights that the latest actions commanded, the newest last, m; delayed actions stand
+    here before the legs move."""
+    imu: Float[Array, "*batch samples 6"]
+    """Latest IMU samples, the newest last, rad/s and m/s^2."""
+    tilt: Float[Array, "*batch"]
+    """Body tilt of the last reward, deg."""
 
 
 class Targets(NamedTuple):
     """Servo targets at every physics step of a decision."""
 
-    board: Array
-    """(..., sim_steps, 2) board angles about X and Y, rad."""
-    joints: Array
-    """(..., sim_steps, legs, 3) abduction, hip and knee angles, rad."""
+    board: Float[Array, "*batch sim_steps 2"]
+    """Board angles about X and Y, rad."""
+    joints: Float[Array, "*batch sim_steps legs 3"]
+    """Abduction, hip and knee angles, rad."""
 
 
 class Motion(NamedTuple):
     """What an engine measures at every physics step of a decision; NaN where it has diverged."""
 
-    imu: Array
-    """(..., sim_steps, 6) gyro in rad/s and accelerometer in m/s^2, before each step."""
-    tilt: Array
-    """(..., sim_steps) body tilt after each step, deg."""
-    joint_angles: Array
-    """(..., sim_steps, legs, 3) after each step, rad."""
+    imu: Float[Array, "*batch sim_steps 6"]
+    """Gyro in rad/s and accelerometer in m/s^2, before each step."""
+    tilt: Float[Array, "*batch sim_steps"]
+    """Body tilt after each step, deg."""
+    joint_angles: Float[Array, "*batch sim_steps legs 3"]
+    """After each step, rad."""
 
 
+@runtime_checkable
 class Engine(Protocol):
     """Moves the physics by one decision. `physics` is the engine's own: a state, or env ids."""
 
-    def push(self, physics: Any, velocity: Array) -> Any:
-        """Adds (..., 2) m/s along the world's x and y to the trunk's velocity."""
+    def push(self, physics: Any, velocity: Float[Array, "*batch 2"]) -> Any:
+        """Adds to the trunk's velocity along the world's x and y, m/s."""
         ...
 
     def advance(
@@ -85,8 +81,8 @@ class EnvState(NamedTuple):
     memory: Memory
     scenario: tilt.Scenario
     """Where the board goes."""
-    env_steps: Array
-    """(...) decisions since the episode's start."""
+    env_steps: Int[Array, "*batch"]
+    """Decisions since the episode's start."""
     params: DomainParams | None
     """None: the nominal model, no sensor noise, no action delay."""
     pushes: Pushes | None
@@ -95,22 +91,22 @@ class EnvState(NamedTuple):
 class Outcome(NamedTuple):
     """What came of a decision."""
 
-    obs: Array
-    """(..., obs_size) the network's next input."""
-    rewards: dict[str, Array]
-    """(...) by name (`reward_terms`); their sum is the reward."""
-    imu: Array
-    """(..., sim_steps, 6) IMU samples with noise, rad/s and m/s^2."""
-    tilt: Array
-    """(..., sim_steps) body tilt after each step, deg."""
-    terminated: Array
-    """(...) bool, whether the body tilted past `fail_tilt`, or the simulation diverged."""
-    diverged: Array
-    """(...) bool, whether the simulation gave values that no robot can reach."""
+    obs: Float[Array, "*batch obs_size"]
+    """The network's next input."""
+    rewards: dict[str, Float[Array, "*batch"]]
+    """By name (`reward_terms`); their sum is the reward."""
+    imu: Float[Array, "*batch sim_steps 6"]
+    """IMU samples with noise, rad/s and m/s^2."""
+    tilt: Float[Array, "*batch sim_steps"]
+    """Body tilt after each step, deg."""
+    terminated: Bool[Array, "*batch"]
+    """Whether the body tilted past `fail_tilt`, or the simulation diverged."""
+    diverged: Bool[Array, "*batch"]
+    """Whether the simulation gave values that no robot can reach."""
 
     @property
-    def reward(self) -> Array:
-        """(...) sum of the terms."""
+    def reward(self) -> Float[Array, "*batch"]:
+        """Sum of the terms."""
         return sum(self.rewards.values())
 
 
@@ -119,27 +115,16 @@ def step(
     robot: Robot,
     engine: Engine,
     state: EnvState,
-    change: Array,
-    noise: Array | None,
+    change: Float[Array, "*batch 2"],
+    noise: Float[Array, "*batch sim_steps 6"] | None,
 ) -> tuple[EnvState, Outcome]:
-    """Takes one decision.
+    """Takes one decision, in one env or in a batch.
 
-    Args:
-      task: rates, weights, limits, layout.
-      robot: its legs.
-      engine: moves the physics.
-      state: of one env, or of a batch (...).
-      change: (..., 2) a_x and a_y of the action, m.
-      noise: (..., sim_steps, 6) standard normal numbers, one per IMU sample; None: no noise.
-
-    Returns:
-      The state `ctrl_dt` later, and the outcome.
+    `change` is a_x and a_y of the action, m; `noise` has a standard normal number per IMU sample.
+    Returns the state `ctrl_dt` later, and the outcome.
     """
-    params, physics = state.params, state.physics
-    delayed = None if params is None else params.delay > 0
-    memory, targets = pre_step(
-        task, robot, state.memory, change, delayed, state.scenario, state.env_steps
-    )
+    memory, targets = pre_step(task, robot, state, change)
+    physics, params = state.physics, state.params
     if state.pushes is not None:
         physics = engine.push(physics, push_velocity(state.pushes, state.env_steps))
     physics, motion = engine.advance(physics, targets, params)
@@ -150,56 +135,34 @@ def step(
     return state, outcome
 
 
-def initial_memory(task: TaskConfig, robot: Robot, still: Array) -> Memory:
-    """The memory of a robot that has been standing for a while.
-
-    Args:
-      task: standing height, lengths of the histories.
-      robot: its legs.
-      still: (..., 6) IMU sample at rest, rad/s and m/s^2.
-    """
-    xp = still.__array_namespace__()
-    rows = input_rows(task, robot)
-    heights = xp.zeros((*still.shape[:-1], len(robot.legs)), still.dtype) + task.body_height
+def initial_memory(task: TaskConfig, robot: Robot, still: Float[Array, "*batch 6"]) -> Memory:
+    """The memory of a robot that has been standing for a while, with IMU samples `still`."""
+    xp, rows = still.__array_namespace__(), input_rows(task, robot)
+    heights = xp.full((*still.shape[:-1], len(robot.legs)), task.body_height, still.dtype)
     return Memory(
         heights=heights,
-        commanded=_repeated(heights, lookback(rows, "commands")),
-        imu=_repeated(still, lookback(rows, "imu")),
+        commanded=xp.repeat(heights[..., None, :], lookback(rows, "commands"), axis=-2),
+        imu=xp.repeat(still[..., None, :], lookback(rows, "imu"), axis=-2),
         tilt=xp.zeros_like(still[..., 0]),
     )
 
 
 def pre_step(
-    task: TaskConfig,
-    robot: Robot,
-    memory: Memory,
-    change: Array,
-    delayed: Array | None,
-    scenario: tilt.Scenario,
-    env_steps: Array,
+    task: TaskConfig, robot: Robot, state: EnvState, change: Float[Array, "*batch 2"]
 ) -> tuple[Memory, Targets]:
-    """Turns an action into servo targets.
+    """Turns an action, a_x and a_y in m, into servo targets and the memory with the new command.
 
-    Args:
-      task: rates.
-      robot: its legs.
-      memory: from the last decision.
-      change: (..., 2) a_x and a_y of the action, m.
-      delayed: (...) bool, whether the legs obey one decision later; None: nowhere.
-      scenario: where the board goes.
-      env_steps: (...) decisions since the start.
-
-    Returns:
-      The memory with the new command, and the targets. Those of step i are for time
-      (i + 1) * sim_dt of the decision.
+    Targets of step i are for time (i + 1) * sim_dt of the decision. With an action delay the legs
+    obey one decision later. `state.physics` does not matter.
     """
-    xp = memory.heights.__array_namespace__()
+    memory, xp = state.memory, state.memory.heights.__array_namespace__()
     last = memory.commanded[..., -1, :]
-    command = apply_action(task, robot, last, change)
-    heights = command if delayed is None else xp.where(delayed[..., None], last, command)
+    command = heights = apply_action(robot, last, change)
+    if state.params is not None:
+        heights = xp.where(state.params.delay[..., None] > 0, last, command)
     sim_step = np.arange(1, task.sim_steps + 1).astype(heights.dtype)
-    time = task.ctrl_dt * env_steps[..., None] + task.sim_dt * sim_step
-    board = tilt.board_angle(task, scenario, time) * (np.pi / 180)
+    time = task.ctrl_dt * state.env_steps[..., None] + task.sim_dt * sim_step
+    board = tilt.board_angle(task, state.scenario, time) * (np.pi / 180)
     path = kinematics.ramp(task, memory.heights, heights)
     moving = kinematics.joint_angles(robot, path[..., : task.ramp_steps, :])
     resting = xp.repeat(moving[..., -1:, :, :], task.sim_steps - task.ramp_steps, axis=-3)
@@ -216,14 +179,8 @@ def post_step(
     Where the simulation diverged the robot has fallen: its tilt counts as `fail_tilt` throughout
     the decision, the IMU holds its last sample, and the legs count as at their targets.
 
-    Args:
-      task: weights, limits, layout.
-      robot: its legs.
-      memory: from `pre_step`.
-      motion: from the engine, sensor noise included.
-
-    Returns:
-      The memory for the next decision, and the outcome.
+    `memory` is that of `pre_step`; `motion` includes sensor noise. Returns the memory for the next
+    decision, and the outcome.
     """
     samples, tilts, angles = motion.imu, motion.tilt, motion.joint_angles[..., -1, :, :]
     xp = samples.__array_namespace__()
@@ -241,20 +198,16 @@ def post_step(
     return memory, Outcome(obs, rewards, samples, tilts, terminated, diverged)
 
 
-def _diverged(values: Array, axes: int) -> Array:
-    """(...) whether any value over the last `axes` axes is NaN or `DIVERGED` or more."""
+def _diverged(values: Float[Array, "..."], axes: int) -> Bool[Array, "..."]:
+    """Whether any value over the last `axes` axes is NaN or `DIVERGED` or more."""
     bad = ~(abs(values) < DIVERGED)
     return bad.reshape(*values.shape[:-axes], -1).any(axis=-1)
 
 
-def observation(task: TaskConfig, robot: Robot, memory: Memory, angles: Array) -> Array:
-    """The network's input (..., obs_size), for measured joint angles (..., legs, 3), rad."""
+def observation(
+    task: TaskConfig, robot: Robot, memory: Memory, angles: Float[Array, "*batch legs 3"]
+) -> Float[Array, "*batch obs_size"]:
+    """The network's input, for measured joint angles, rad."""
     heights = kinematics.foot_heights(robot, angles)
     signals = Signals(heights[..., None, :], memory.commanded, memory.imu)
     return observe(input_rows(task, robot), signals)
-
-
-def _repeated(row: Array, times: int) -> Array:
-    """Returns (..., times, k) for (..., k)."""
-    xp = row.__array_namespace__()
-    return xp.zeros((*row.shape[:-1], times, 1), row.dtype) + row[..., None, :]

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float32, Int32
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.robots.catalogue import Robot
@@ -12,12 +13,12 @@ from mjx_balance.task.observation import input_rows
 class Symmetries(NamedTuple):
     """The group of reflections, the identity first."""
 
-    obs_index: np.ndarray
-    """(g, obs_size) entry of the observation that takes each place."""
-    obs_sign: np.ndarray
-    """(g, obs_size) its sign there, float32."""
-    action_index: np.ndarray
-    """(g, num_actions) index that each action becomes, int32."""
+    obs_index: Int32[np.ndarray, "reflections obs_size"]
+    """Entry of the observation that takes each place."""
+    obs_sign: Float32[np.ndarray, "reflections obs_size"]
+    """Its sign there."""
+    action_index: Int32[np.ndarray, "reflections actions"]
+    """Index that each action becomes."""
 
 
 def symmetries(task: TaskConfig, robot: Robot) -> Symmetries:

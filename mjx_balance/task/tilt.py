@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.task import Array
@@ -16,12 +17,12 @@ class Scenario(NamedTuple):
     `k * target_period - phase` and stays there once it has arrived.
     """
 
-    targets: Array
-    """(..., n, 2) board angles about X and Y, deg."""
-    phase: Array
-    """(...) time the first target is already old at time 0, s."""
-    rate: Array
-    """(...) speed of the board on each axis, deg/s."""
+    targets: Float[Array, "*batch targets 2"]
+    """Board angles about X and Y, deg."""
+    phase: Float[Array, "*batch"]
+    """Time the first target is already old at time 0, s."""
+    rate: Float[Array, "*batch"]
+    """Speed of the board on each axis, deg/s."""
 
 
 def num_targets(task: TaskConfig, duration: float) -> int:
@@ -29,21 +30,15 @@ def num_targets(task: TaskConfig, duration: float) -> int:
     return int(np.ceil(duration / task.target_period)) + 1
 
 
-def board_angle(task: TaskConfig, scenario: Scenario, time: Array) -> Array:
-    """Target angle of the board.
+def board_angle(
+    task: TaskConfig, scenario: Scenario, time: Float[Array, "*batch times"]
+) -> Float[Array, "*batch times 2"]:
+    """Target angle of the board, deg, at times since the start, s, none of them negative.
 
     Each axis moves at `rate` from the last target to the next and then rests;
     it always arrives within the period (config checks that for the training, the
-    suites for theirs), so the angle is a closed form of the time.
-
-    Args:
-      task: the period.
-      scenario: one scenario, targets (n, 2), or a batch.
-      time: (..., m) s since the start, not negative; past the last target the
-        board rests there.
-
-    Returns:
-      (..., m, 2) deg.
+    suites for theirs), so the angle is a closed form of the time. The board stays at the last
+    target.
     """
     targets, phase, rate = scenario
     xp = targets.__array_namespace__()
@@ -59,16 +54,17 @@ def board_angle(task: TaskConfig, scenario: Scenario, time: Array) -> Array:
     return start + xp.clip(change, -reach, reach)
 
 
-def disc_targets(incline: Array, direction: Array, magnitude: Array) -> Array:
-    """Targets in any direction (paper 3.1): direction and total tilt drawn from [0, 1).
+def disc_targets(
+    incline: Float[Array, "..."],
+    direction: Float[Array, "*batch"],
+    magnitude: Float[Array, "*batch"],
+) -> Float[Array, "*batch 2"]:
+    """Targets in any direction, deg about X and Y (paper 3.1).
 
     Args:
-      incline: (...) greatest total tilt, deg.
-      direction: (...) share of a full turn.
-      magnitude: (...) share of the greatest incline.
-
-    Returns:
-      (..., 2) deg about X and Y.
+      incline: greatest total tilt, deg.
+      direction: share of a full turn, [0, 1).
+      magnitude: share of the greatest incline, [0, 1).
     """
     xp = direction.__array_namespace__()
     angle = 2 * np.pi * direction

@@ -252,7 +252,7 @@ def test_a_baseline_stands_on_the_robot_asked_for_as_high_as_it_should() -> None
     for name in (None, "b2"):
         scene, _ = ControllerArgs(controller="none", robot=name).load()
         robot = find_robot(name or "quadruped")
-        assert (scene.robot, scene.config.task.body_height) == (robot, robot.body_height)
+        assert (scene.robot, scene.task.body_height) == (robot, robot.body_height)
 
 
 @pytest.mark.parametrize("flag", ["-h", "--help"])

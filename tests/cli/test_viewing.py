@@ -109,7 +109,7 @@ def test_the_next_round_of_a_suite_is_another_one(scene: Scene) -> None:
     one = session(scene, "none", "corner")
     while one.falls < 2:
         one.step()
-    third = draw_suite(scene.config, "corner", 1, 60.0, seed=5).scenario
+    third = draw_suite(scene.task, scene.robot, "corner", 1, 60.0, seed=5).scenario
     np.testing.assert_array_equal(one.env.state.scenario.targets, third.targets)
 
 

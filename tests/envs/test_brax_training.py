@@ -143,7 +143,7 @@ def test_the_next_episode_goes_as_its_scenario_says(env: BalanceEnv, states: lis
 
 
 @pytest.mark.slow
-def test_circumstances_are_drawn_anew_too() -> None:
+def test_domain_parameters_are_drawn_anew_too() -> None:
     ranges = RandomizationConfig(payload=5.0, gyro_noise=0.01, push_max=0.2, push_period=0.4)
     found = wrapped_states(wrap(BalanceEnv(short(ranges), "continuous"), EPISODE), EPISODE)
     before, after = (
@@ -193,7 +193,7 @@ def test_braxs_trainers_get_a_copy_of_every_leaf_per_device() -> None:
 def test_an_evaluation_takes_height_changes_too(env: BalanceEnv) -> None:
     """Of those of the grid it makes what it makes of their indices."""
     scene, table = env.scene, action_table(env.config.task)
-    scenarios = draw_suite(scene.config, "corner", 3, 2.0, 0).scenario
+    scenarios = draw_suite(scene.task, scene.robot, "corner", 3, 2.0, 0).scenario
 
     def index(view: View) -> np.ndarray:
         return (view.ids * 97 + view.env_steps * 31) % 441

@@ -18,13 +18,13 @@ from mjx_balance.task.randomization import DomainParams
 
 MANY = 4_000
 ENVS, STAND = 32, 220
-KICKED = (13, 25, 38)
-"""Decisions of an episode that begin with a kick: 2.5, 5 and 7.5 s, in decisions of 0.2 s."""
+PUSHED = (13, 25, 38)
+"""Decisions of an episode that begin with a push: 2.5, 5 and 7.5 s, in decisions of 0.2 s."""
 
 
 @pytest.fixture(scope="module")
 def drawn(fleet: Any) -> tuple[DomainParams, Any, np.ndarray]:
-    """Circumstances, scenarios and kicks of many resets."""
+    """Domain parameters, scenarios and pushes of many resets."""
 
     def draw(key: jax.Array) -> Any:
         state = fleet.env.reset(key).pipeline_state
@@ -33,52 +33,52 @@ def drawn(fleet: Any) -> tuple[DomainParams, Any, np.ndarray]:
     return jax.device_get(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), MANY)))
 
 
-def test_circumstances_fill_their_ranges(drawn: tuple[DomainParams, Any, np.ndarray]) -> None:
-    conditions, _, kicks = drawn
+def test_domain_parameters_fill_their_ranges(drawn: tuple[DomainParams, Any, np.ndarray]) -> None:
+    params, _, pushes = drawn
     ranges = {
-        "payload": (conditions.payload, 0, 5),
-        "x": (conditions.payload_at[:, 0], -0.05, 0.05),
-        "y": (conditions.payload_at[:, 1], -0.05, 0.05),
-        "friction": (conditions.friction, 0.4, 1.0),
-        "gain": (conditions.gain, 0.8, 1.2),
-        "speed": (np.linalg.norm(kicks[:, 2], axis=-1), 0.05, 0.1),
-        "direction": (np.arctan2(kicks[:, 0, 1], kicks[:, 0, 0]), -np.pi, np.pi),
+        "payload": (params.payload, 0, 5),
+        "x": (params.payload_at[:, 0], -0.05, 0.05),
+        "y": (params.payload_at[:, 1], -0.05, 0.05),
+        "friction": (params.friction, 0.4, 1.0),
+        "gain": (params.gain, 0.8, 1.2),
+        "speed": (np.linalg.norm(pushes[:, 2], axis=-1), 0.05, 0.1),
+        "direction": (np.arctan2(pushes[:, 0, 1], pushes[:, 0, 0]), -np.pi, np.pi),
     }
-    assert kicks.shape == (MANY, 3, 2)
+    assert pushes.shape == (MANY, 3, 2)
     for name, (values, low, high) in ranges.items():
         test = scipy.stats.kstest(values, "uniform", (low, high - low))
         assert test.pvalue > 1e-3, name
-    np.testing.assert_allclose(conditions.payload_at[:, 2], 0.08, rtol=1e-6)
-    assert set(conditions.delay) == {0, 1}
-    assert conditions.delay.mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(MANY))
+    np.testing.assert_allclose(params.payload_at[:, 2], 0.08, rtol=1e-6)
+    assert set(params.delay) == {0, 1}
+    assert params.delay.mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(MANY))
     sigma = np.asarray([0.002] * 3 + [0.023] * 3, np.float32)
-    np.testing.assert_allclose(conditions.imu_noise, np.tile(sigma, (MANY, 1)))
+    np.testing.assert_allclose(params.imu_noise, np.tile(sigma, (MANY, 1)))
 
 
 def test_no_two_draws_of_an_env_go_together(drawn: tuple[DomainParams, Any, np.ndarray]) -> None:
     """A key used twice would tie a payload to a target."""
-    conditions, scenario, kicks = drawn
+    params, scenario, pushes = drawn
     columns = np.column_stack(
         (
-            conditions.payload,
-            conditions.payload_at[:, :2],
-            conditions.friction,
-            conditions.gain,
-            conditions.delay,
+            params.payload,
+            params.payload_at[:, :2],
+            params.friction,
+            params.gain,
+            params.delay,
             scenario.targets[:, 1],
             np.linalg.norm(scenario.targets[:, 1], axis=-1),
             scenario.phase,
-            kicks.reshape(MANY, -1),
+            pushes.reshape(MANY, -1),
         )
     )
     together = scipy.stats.spearmanr(columns).statistic - np.eye(columns.shape[1])
     assert np.abs(together).max() < 0.07
 
 
-def test_a_kick_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: Any) -> None:
+def test_a_push_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: Any) -> None:
     """On level boards, robots given that velocity by hand move alike, whatever the decision."""
     start = fleet.level(fleet.under(fleet.reset(fleet.keys(5)), fleet.nominal()))
-    kicks, physics = np.asarray(start.pipeline_state.pushes.velocity), start.pipeline_state.physics
+    pushes, physics = np.asarray(start.pipeline_state.pushes.velocity), start.pipeline_state.physics
     free = fleet.env.scene.model.jnt_dofadr[fleet.env.scene.model.joint("robot/root").id]
 
     def after(decision: int, velocity: np.ndarray) -> Any:
@@ -93,12 +93,12 @@ def test_a_kick_is_added_to_the_trunks_velocity_when_its_decision_begins(fleet: 
     for decision in (0, 12, 14, 24, 26, 49):
         imu = after(decision, none).pipeline_state.memory.imu
         np.testing.assert_allclose(imu, still.pipeline_state.memory.imu, atol=1e-3)
-    for k, decision in enumerate(KICKED):
-        kicked, by_hand = after(decision, none), after(1, kicks[:, k])
+    for k, decision in enumerate(PUSHED):
+        pushed, by_hand = after(decision, none), after(1, pushes[:, k])
         for name in ("qpos", "qvel"):
-            ours, theirs = (getattr(s.pipeline_state.physics, name) for s in (kicked, by_hand))
+            ours, theirs = (getattr(s.pipeline_state.physics, name) for s in (pushed, by_hand))
             np.testing.assert_allclose(ours, theirs, atol=1e-4)
-        shaken = np.abs(kicked.pipeline_state.memory.imu - still.pipeline_state.memory.imu).max(
+        shaken = np.abs(pushed.pipeline_state.memory.imu - still.pipeline_state.memory.imu).max(
             axis=(1, 2)
         )
         assert shaken.min() > 0.5, "m/s^2"
@@ -114,10 +114,10 @@ def test_pushes_change_no_other_draw(fleet: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
-def test_nobody_is_kicked_unless_asked_for() -> None:
-    """Nor in an episode that ends, after 60 s, when the first kick is due."""
-    late = RandomizationConfig(push_max=0.2, push_period=60.0)
-    for random in (RandomizationConfig(), late):
+def test_nobody_is_pushed_unless_asked_for() -> None:
+    """Nor in an episode that ends, after 60 s, when the first push is due."""
+    rare = RandomizationConfig(push_max=0.2, push_period=60.0)
+    for random in (RandomizationConfig(), rare):
         env = BalanceEnv(dataclasses.replace(preset("default"), randomization=random))
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
         assert state.pushes is None
@@ -132,8 +132,8 @@ def noise(fleet: Any) -> tuple[np.ndarray, list[Any], list[Any]]:
     """Noise (2, ENVS, 50, 6) of two decisions in units of its size, with and without it."""
     loud = fleet.nominal()._replace(imu_noise=SIGMA.astype(np.float32))
     runs = []
-    for conditions in (fleet.nominal(), loud):
-        state, states = fleet.under(fleet.reset(fleet.keys(4)), conditions), []
+    for params in (fleet.nominal(), loud):
+        state, states = fleet.under(fleet.reset(fleet.keys(4)), params), []
         for _ in range(2):
             state = fleet.step(state, np.full(ENVS, STAND))
             states.append(jax.device_get(state))
@@ -188,7 +188,7 @@ def test_noise_is_seen_and_moves_nobody(fleet: Any, noise: Any) -> None:
         np.testing.assert_allclose(difference[:, entry], np.degrees(rate), atol=1e-4)
 
 
-def test_envs_of_a_batch_move_in_their_own_circumstances(fleet: Any) -> None:
+def test_envs_of_a_batch_move_under_their_own_parameters(fleet: Any) -> None:
     """Two payloads, gains and soles under one scenario: each is where it is alone."""
     state = fleet.reset(fleet.keys(9))
     drawn = jax.device_get(state.pipeline_state.params)
@@ -199,10 +199,8 @@ def test_envs_of_a_batch_move_in_their_own_circumstances(fleet: Any) -> None:
     state = with_state(state, scenario=scenario)
     actions = np.full(ENVS, STAND + 42)
     first, second = (
-        jax.device_get(
-            fleet.step(fleet.under(state, conditions), actions)
-        ).pipeline_state.physics.qpos
-        for conditions in (drawn, DomainParams(*turned))
+        jax.device_get(fleet.step(fleet.under(state, params), actions)).pipeline_state.physics.qpos
+        for params in (drawn, DomainParams(*turned))
     )
     np.testing.assert_allclose(np.roll(first, 1, axis=0), second, atol=1e-6)
     height = first[:, fleet.env.scene.trunk_quat[0] - 1]

@@ -32,6 +32,7 @@ from mjx_balance.evaluation.rollout import (
 )
 from mjx_balance.evaluation.suites import draw_suite
 from mjx_balance.policy.file import PolicyError, load_policy
+from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.observation import observation_names
 from mjx_balance.task.pushes import Pushes
@@ -46,7 +47,8 @@ def always(action: int):
 
 
 def draw(config: Config, suite: str, count: int, duration: float, seed: int) -> Scenario:
-    return draw_suite(config, suite, count, duration, seed).scenario
+    robot = find_robot(config.robot)
+    return draw_suite(config.task, robot, suite, count, duration, seed).scenario
 
 
 def level_boards(config: Config, count: int, duration: float) -> Scenario:
@@ -107,9 +109,9 @@ class ByHand:
         self.imu, self.board = [scene.stance.imu] * 200, np.zeros(2)
         self.qpos: list[np.ndarray] = []
 
-    def observation(self, config: Config) -> np.ndarray:
+    def observation(self) -> np.ndarray:
         """Interprets the names of its entries."""
-        values, task = [], config.task
+        values, task = [], self.scene.task
         mujoco.mj_kinematics(self.model, self.data)
         frame = self.data.body("robot/trunk").xmat.reshape(3, 3)
         for name in observation_names(task, self.scene.robot):
@@ -162,7 +164,7 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
     """
     lags = {"command_lags": (0, 2), "imu_mean": 4, "gyro_lags": (0, 20), "accel_lags": (3, 60)}
     task = dataclasses.replace(config.task, **(lags if rich else {}))  # pyright: ignore[reportArgumentType]
-    scene = dataclasses.replace(scene, config=dataclasses.replace(config, task=task))
+    scene = dataclasses.replace(scene, task=task)
     targets = np.asarray([[(4.0, -2.0)], [(-3.0, 1.0)]])
     scenarios = Scenario(targets, np.zeros(2), np.asarray((3.5, 2.0)))
     conditions = nominal(2)._replace(
@@ -177,7 +179,7 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
     def act(view: View) -> np.ndarray:
         assert view.delayed.tolist() == [False, True]
         for k, single in enumerate(singles):
-            np.testing.assert_allclose(view.obs[k], single.observation(scene.config), atol=1e-6)
+            np.testing.assert_allclose(view.obs[k], single.observation(), atol=1e-6)
             np.testing.assert_allclose(view.imu[k], single.imu[-50:], atol=1e-7)
             np.testing.assert_allclose(view.qpos[k], single.data.qpos, atol=1e-9)
             np.testing.assert_allclose(view.qvel[k], single.data.qvel, atol=1e-8)
@@ -207,7 +209,7 @@ def test_pushes_come_between_a_choice_and_its_decision(config: Config, scene: Sc
 
     def act(view: View) -> np.ndarray:
         for k, single in enumerate(singles):
-            np.testing.assert_allclose(view.obs[k], single.observation(config), atol=1e-6)
+            np.testing.assert_allclose(view.obs[k], single.observation(), atol=1e-6)
             np.testing.assert_allclose(view.qvel[k], single.data.qvel, atol=1e-8)
             if view.env_steps in (1, 4):
                 single.data.qvel[free : free + 2] += velocity[k, (1, 4).index(view.env_steps)]
@@ -270,7 +272,7 @@ def test_who_fell_is_out_even_if_it_rights_itself(config: Config, scene: Scene) 
         calls.append(view.env_steps)
         return np.full(1, LEFT_UP if view.env_steps == 0 else STAND)
 
-    rollout = roll_out(dataclasses.replace(scene, config=strict), once, Episodes(scenarios), 1.0)
+    rollout = roll_out(dataclasses.replace(scene, task=strict.task), once, Episodes(scenarios), 1.0)
     assert calls == [0]
     assert rollout.fell_at[0] == np.flatnonzero(course > limit)[0]
     assert (rollout.tilt[0, rollout.fell_at[0] :] == limit).all()
@@ -402,7 +404,7 @@ def test_cells_of_the_envelope_are_inclines_by_speeds(
 
     def roll(scene: Scene, controller: Any, episodes: Episodes, *_: Any, **__: Any):
         drawn = episodes.scenario
-        asked.append((scene.config, drawn))
+        asked.append((scene.task, drawn))
         incline, rate = np.abs(drawn.targets[:, 0, 0]), drawn.rate
         fell = (incline > 8) | (rate > 5)
         # One of the two scenarios of a cell in the corner stands.
@@ -424,12 +426,12 @@ def test_cells_of_the_envelope_are_inclines_by_speeds(
     assert found.reach == pytest.approx(10.35, abs=0.02)
     (used, drawn) = asked[0]
     # The slowest board needs 24 deg / 2.5 deg/s = 9.6 s, less than the 10 s of the task.
-    assert used.task.target_period == 10.0
+    assert used.target_period == 10.0
     assert (np.abs(drawn.targets) == np.abs(drawn.targets[:, :1, :1])).all(), "both axes at once"
     assert len(np.unique(np.sign(drawn.targets).reshape(-1, 2), axis=0)) == 4
     hasty = dataclasses.replace(config, task=dataclasses.replace(config.task, target_period=5.0))
-    envelope(dataclasses.replace(scene, config=hasty), always(STAND), 2, 12.0, 3)
-    assert asked[1][0].task.target_period == pytest.approx(9.6)
+    envelope(dataclasses.replace(scene, task=hasty.task), always(STAND), 2, 12.0, 3)
+    assert asked[1][0].target_period == pytest.approx(9.6)
     with pytest.raises(EvaluationError, match="scenarios is 0"):
         envelope(scene, always(STAND), 0, 12.0, 3)
 

@@ -1,6 +1,7 @@
 """Suites are what they say, and their scenarios depend on nothing but the seed."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,6 +24,10 @@ def with_task(config: Config, **values: float) -> Config:
     return dataclasses.replace(config, task=dataclasses.replace(config.task, **values))
 
 
+def draw(config: Config, *rest: Any) -> Episodes:
+    return draw_suite(config.task, find_robot(config.robot), *rest)
+
+
 def draws(seed: int, k: int, targets: int = 7) -> tuple[np.ndarray, np.ndarray]:
     """Scenario k's own random numbers: two for every target, then those of its circumstances."""
     rng = np.random.default_rng((seed, k))
@@ -31,16 +36,16 @@ def draws(seed: int, k: int, targets: int = 7) -> tuple[np.ndarray, np.ndarray]:
 
 def test_scenarios_depend_on_the_seed_and_not_on_their_number(config: Config) -> None:
     for suite in SUITES:
-        few, many = (draw_suite(config, suite, n, 60, 3) for n in (2, 5))
+        few, many = (draw(config, suite, n, 60, 3) for n in (2, 5))
         many = Episodes(*(rows(part, np.arange(2)) for part in many[:3]))
         jax.tree.map(np.testing.assert_array_equal, few[:3], many[:3])
-    seeds = [draw_suite(config, "paper", 5, 60, n).scenario.targets for n in range(4)]
+    seeds = [draw(config, "paper", 5, 60, n).scenario.targets for n in range(4)]
     assert len(np.unique(np.concatenate(seeds)[:, 0], axis=0)) == 20, "no two are alike"
 
 
 def test_every_target_of_paper_and_corner_by_its_draw(config: Config) -> None:
     """60 s need 7 targets. Published figures hold for these scenarios and no others."""
-    paper, corner = (draw_suite(config, name, 3, 60.0, 5).scenario for name in ("paper", "corner"))
+    paper, corner = (draw(config, name, 3, 60.0, 5).scenario for name in ("paper", "corner"))
     assert paper.targets.shape == corner.targets.shape == (3, 7, 2)
     for k in range(3):
         uniform, _ = draws(5, k)
@@ -56,7 +61,7 @@ def test_every_target_of_paper_and_corner_by_its_draw(config: Config) -> None:
 def test_circumstances_by_their_draws(config: Config) -> None:
     """Draw 0 is the payload, 1 and 2 its place, 3 the friction, 4 the gain."""
     names = ("payload", "friction", "gains")
-    payload, friction, gains = (draw_suite(config, name, 4, 60.0, 2).params for name in names)
+    payload, friction, gains = (draw(config, name, 4, 60.0, 2).params for name in names)
     others = np.asarray([draws(2, k)[1] for k in range(4)])
     np.testing.assert_allclose(payload.payload, 5 * others[:, 0])
     np.testing.assert_allclose(payload.payload_at[:, 0], 0.1 * others[:, 1] - 0.05)
@@ -68,7 +73,7 @@ def test_circumstances_by_their_draws(config: Config) -> None:
 def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
     """The targets of `paper`, at up to 4.453 deg/s or stretched up to the legs' reach."""
     paper, fast, steep = (
-        draw_suite(config, name, 4, 60.0, 2).scenario for name in ("paper", "fast", "steep")
+        draw(config, name, 4, 60.0, 2).scenario for name in ("paper", "fast", "steep")
     )
     others = np.asarray([draws(2, k)[1] for k in range(4)])
     np.testing.assert_allclose(fast.rate, 3.5 + (4.4531 - 3.5) * others[:, DRAWS], atol=1e-4)
@@ -81,58 +86,58 @@ def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
 
 def test_pushes_by_their_draws(config: Config) -> None:
     """Pushes of 0.2 to 0.4 m/s every 5 s; a scenario's come from a generator of their own."""
-    pushes = draw_suite(config, "push", 3, 60.0, 5).pushes
+    pushes = draw(config, "push", 3, 60.0, 5).pushes
     assert pushes.due[2].tolist() == [25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 275]
     for k in range(3):
         speed, turn = np.random.default_rng((5, k, 2)).uniform(size=(11, 2)).T
         speed, turn = 0.2 + 0.2 * speed, 2 * np.pi * turn
         expected = np.stack((speed * np.cos(turn), speed * np.sin(turn)), axis=-1)
         np.testing.assert_allclose(pushes.velocity[k], expected, atol=1e-12)
-    fewer = draw_suite(config, "push", 2, 60.0, 5).pushes
-    shorter = draw_suite(config, "push", 3, 26, 5).pushes
+    fewer = draw(config, "push", 2, 60.0, 5).pushes
+    shorter = draw(config, "push", 3, 26, 5).pushes
     np.testing.assert_array_equal(fewer.velocity, pushes.velocity[:2])
     np.testing.assert_array_equal(shorter.velocity, pushes.velocity[:, :5])
 
 
 def test_pushes_happen_in_the_scenarios_of_paper_and_in_no_other_suite(config: Config) -> None:
-    push, paper = (draw_suite(config, name, 4, 60.0, 2) for name in ("push", "paper"))
+    push, paper = (draw(config, name, 4, 60.0, 2) for name in ("push", "paper"))
     for ours, theirs in zip(push.scenario, paper.scenario, strict=True):
         np.testing.assert_array_equal(ours, theirs)
     for values in (push.params.payload, push.params.imu_noise, push.params.delay):
         assert not values.any()
     for name in SUITES:
-        pushes = draw_suite(config, name, 4, 60.0, 2).pushes
+        pushes = draw(config, name, 4, 60.0, 2).pushes
         assert (pushes is not None) == (name == "push")
 
 
 def test_a_config_beyond_the_limits_is_left_as_it_is(config: Config) -> None:
     """A board that is faster than can be followed is no slower in `fast`."""
     quick = with_task(config, board_rate=6.0)
-    assert draw_suite(quick, "fast", 3, 20, 0).scenario.rate.tolist() == [6.0] * 3
+    assert draw(quick, "fast", 3, 20, 0).scenario.rate.tolist() == [6.0] * 3
 
 
 @pytest.mark.parametrize(("duration", "targets"), [(5.0, 2), (10.0, 2), (10.1, 3), (60.0, 7)])
 def test_there_are_targets_to_the_end(config: Config, duration: float, targets: int) -> None:
-    assert draw_suite(config, "paper", 2, duration, 0).scenario.targets.shape == (2, targets, 2)
+    assert draw(config, "paper", 2, duration, 0).scenario.targets.shape == (2, targets, 2)
 
 
 def test_a_board_that_does_not_arrive_is_refused(config: Config) -> None:
     """14 deg at 3.5 deg/s take 4 s; in `steep` they may be 2 * 10.3 deg."""
     just = with_task(config, target_period=4.0)
     for suite in ("paper", "corner", "fast"):
-        draw_suite(just, suite, 5, 20, 0)
+        draw(just, suite, 5, 20, 0)
     with pytest.raises(SuiteError, match=r"period is 4\.0 s, but in suite 'steep' .* [45]\.\d"):
-        draw_suite(just, "steep", 50, 20, 0)
+        draw(just, "steep", 50, 20, 0)
     with pytest.raises(SuiteError, match=r"period is 3\.99 s, but in suite 'corner' .* 4\.0"):
-        draw_suite(with_task(config, target_period=3.99), "corner", 1, 20, 0)
+        draw(with_task(config, target_period=3.99), "corner", 1, 20, 0)
 
 
 def test_impossible_wishes_are_refused(config: Config) -> None:
     with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
-        draw_suite(config, "paper", 1, 10, -1)
+        draw(config, "paper", 1, 10, -1)
     names = "paper, corner, noise, payload, friction, gains, latency, push, fast, steep"
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
-        draw_suite(config, "moon", 1, 10, 0)
+        draw(config, "moon", 1, 10, 0)
 
 
 def test_no_seed_serves_two_purposes() -> None:
@@ -165,7 +170,7 @@ def test_authority_and_reach_by_hand(config: Config, robot: Robot) -> None:
 def test_conditions_fill_their_range(
     config: Config, suite: str, field: str, least: float, most: float
 ) -> None:
-    params = draw_suite(config, suite, 300, 10, 0).params
+    params = draw(config, suite, 300, 10, 0).params
     values = getattr(params, field)
     margin = 0.03 * (most - least)
     assert least <= values.min() <= least + margin
@@ -180,15 +185,15 @@ def test_every_suite_follows_the_configs_incline(config: Config) -> None:
     flat = with_task(config, max_incline=2.0)
     for name, suite in SUITES.items():
         if not suite.steep:
-            assert np.abs(draw_suite(flat, name, 20, 60, 0).scenario.targets).max() <= 2.0
+            assert np.abs(draw(flat, name, 20, 60, 0).scenario.targets).max() <= 2.0
 
 
 def test_loads_and_pushes_go_with_the_robot() -> None:
     """B2 is 5.493 times as heavy as ours, and 1.702 times as long."""
     config = for_robot(preset("default"), "b2")
-    conditions = draw_suite(config, "payload", 200, 1.0, 0).params
+    conditions = draw(config, "payload", 200, 1.0, 0).params
     assert conditions.payload.max() == pytest.approx(5 * 5.493, rel=0.03)
     assert np.abs(conditions.payload_at[:, :2]).max() == pytest.approx(0.05 * 1.702, rel=0.03)
-    speeds = np.linalg.norm(draw_suite(config, "push", 100, 60.0, 0).pushes.velocity, axis=-1)
+    speeds = np.linalg.norm(draw(config, "push", 100, 60.0, 0).pushes.velocity, axis=-1)
     limits = (speeds.min(), speeds.max())
     assert limits == pytest.approx((0.2 * 1.702, 0.4 * 1.702), rel=0.01)

@@ -10,7 +10,6 @@ import mujoco.viewer
 import numpy as np
 import pytest
 
-from mjx_balance.config import Config
 from mjx_balance.render import drawing
 from mjx_balance.render.drawing import PICTURE_SIZE, VIDEO_SIZE, RenderError, Window, write
 from mjx_balance.sim.scene import Scene
@@ -19,7 +18,7 @@ from mjx_balance.sim.scene import Scene
 class Grey:
     """Stands for `Painter`, without OpenGL: pictures as bright as the state's first value."""
 
-    def __init__(self, config: Config, size: tuple[int, int] = VIDEO_SIZE):
+    def __init__(self, scene: Scene, size: tuple[int, int] = VIDEO_SIZE):
         self.shape = (*size[::-1], 3)
 
     def draw(self, qpos: np.ndarray) -> np.ndarray:
@@ -34,11 +33,11 @@ def grey(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawing, "Painter", Grey)
 
 
-def test_a_picture_shows_the_board_as_it_stands(config: Config, scene: Scene) -> None:
+def test_a_picture_shows_the_board_as_it_stands(scene: Scene) -> None:
     tilted = scene.stance.qpos.copy()
     tilted[scene.board_qpos] = np.radians((5, -5))
     try:
-        painter = drawing.Painter(config, (160, 90))
+        painter = drawing.Painter(scene, (160, 90))
     except RenderError as error:
         pytest.skip(str(error))
     with contextlib.closing(painter):
@@ -54,12 +53,12 @@ def test_a_picture_shows_the_board_as_it_stands(config: Config, scene: Scene) ->
 )
 @pytest.mark.usefixtures("grey")
 def test_a_video_shows_the_states_in_order_at_real_speed(
-    config: Config, tmp_path: Path, read_video: Any, sim_dt: float, fps: float, stride: int
+    scene: Scene, tmp_path: Path, read_video: Any, sim_dt: float, fps: float, stride: int
 ) -> None:
     """25 times a second, or with every step."""
-    config = dataclasses.replace(config, task=dataclasses.replace(config.task, sim_dt=sim_dt))
+    scene = dataclasses.replace(scene, task=dataclasses.replace(scene.task, sim_dt=sim_dt))
     qpos = np.linspace(20, 220, 10 * stride)[:, None]
-    write(tmp_path / "video.mp4", config, qpos)
+    write(tmp_path / "video.mp4", scene, qpos)
     speed, frames = read_video(tmp_path / "video.mp4")
     assert speed == pytest.approx(fps)
     assert frames.shape[:3] == (10, *VIDEO_SIZE[::-1])
@@ -67,22 +66,22 @@ def test_a_video_shows_the_states_in_order_at_real_speed(
 
 
 def test_no_backend_gives_one_sentence(
-    config: Config, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "steam")  # what the user chose is taken, and nothing else
     with pytest.raises(RenderError, match="offscreen rendering with steam failed"):
-        write(tmp_path / "never.png", config, scene.stance.qpos[None])
+        write(tmp_path / "never.png", scene, scene.stance.qpos[None])
     assert not (tmp_path / "never.png").exists()
 
 
 @pytest.mark.usefixtures("grey")
 def test_a_file_that_cannot_be_written_is_no_matter_of_opengl(
-    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was there before stays, and nothing beside it."""
     states = np.asarray([[7.0], [9.0]])
     (tmp_path / "old.png").write_text("old")
-    write(tmp_path / "new.png", config, states)
+    write(tmp_path / "new.png", scene, states)
     picture = imageio.imread(tmp_path / "new.png")
     assert picture.shape == (*PICTURE_SIZE[::-1], 3)
     assert (picture == 7).all(), "the first state"
@@ -93,14 +92,14 @@ def test_a_file_that_cannot_be_written_is_no_matter_of_opengl(
     monkeypatch.setattr("os.fsync", full)
     for name in ("old.png", "none.png", "no/such.png"):
         with pytest.raises(RenderError) as error:
-            write(tmp_path / name, config, states)
+            write(tmp_path / name, scene, states)
         reason = "No such file or directory" if "/" in name else "No space left on device"
         assert str(error.value) == f"{tmp_path / name} cannot be written: {reason}"
     assert {x.name for x in tmp_path.iterdir()} == {"old.png", "new.png"}
     assert (tmp_path / "old.png").read_text() == "old"
 
 
-def test_macos_wants_mjpython(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_macos_wants_mjpython(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     reason = "`launch_passive` requires that the Python script be run under `mjpython` on macOS"
 
     def launch(*arguments: object, **looks: object) -> None:
@@ -109,4 +108,4 @@ def test_macos_wants_mjpython(config: Config, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
     monkeypatch.setattr("mjx_balance.render.drawing._check_display", lambda: None)
     with pytest.raises(RenderError, match=r"no window can be .*; start it by mjpython, as `mjpy"):
-        Window(config)
+        Window(scene)

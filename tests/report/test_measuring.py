@@ -61,7 +61,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
         tilt = np.tile([0.001 * (len(asked) + 1)] * 2 + [3.0, 6.0], (scenarios, 1))
         asked.append((controller, suite, scenarios, duration, seed, named.get("record", False)))
         fell_at = np.arange(scenarios) + 3  # the first falls in the last step
-        return Rollout(scene.config.task, tilt, fell_at, np.zeros((scenarios, 1)), None, 1.0)
+        return Rollout(scene.task, tilt, fell_at, np.zeros((scenarios, 1)), None, 1.0)
 
     def envelope(scene, controller, scenarios, duration, seed, *more):
         asked.append((controller, "envelope", scenarios, duration, seed, False))

@@ -166,7 +166,7 @@ def test_a_makers_robot_is_what_it_is(name: str) -> None:
 def test_a_makers_robot_can_follow_the_board(name: str) -> None:
     """With our own's margin: 15 mm/s at 0.193 m, 4.45 deg/s, against the board's 3.5."""
     scene = shipped_scene(name)
-    per_second = 5 * scene.config.task.action_max * np.abs(measure_response(scene).gain)
+    per_second = 5 * scene.task.action_max * np.abs(measure_response(scene).gain)
     assert per_second.min() == pytest.approx(4.45, rel=0.08)
     rollout = run_suite(scene, make_controller("rate-oracle", scene), "corner", 4, 12.0, 0)
     assert not rollout.fell.any()
@@ -196,7 +196,7 @@ def test_only_feet_touch_and_only_our_servos_pull(name: str) -> None:
 def test_looks_are_there_for_the_eye(name: str) -> None:
     """And change nothing else."""
     scene = shipped_scene(name)
-    visual = load_scene(scene.config, visual=True)
+    visual = load_scene(check(for_robot(preset("default"), name)), visual=True)
     assert (scene.model.nmesh > 0, visual.model.nmesh > 0) == (False, True)
     assert visual.hash == scene.hash
 

@@ -1,28 +1,28 @@
 """MuJoCo's C engine inside a jitted program: the same env as over MJX, call by call."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fixtures.fleet import episodes_of, with_state
+from fixtures.fleet import RANDOM, episodes_of, with_state
 
-from mjx_balance.config import Config, preset
+from mjx_balance.config import preset
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.evaluation.rollout import roll_out
 from mjx_balance.machine import cores
-from mjx_balance.sim.domain_randomization import MODEL_PARAMS
+from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.engines import ffi
 from mjx_balance.sim.engines.jax_engine import JaxEngine, PhysicsState
 from mjx_balance.sim.engines.mujoco import MujocoEngine
 from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.sim.scene import Scene, load_scene
-from mjx_balance.task.randomization import DomainParams, draw_params
+from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
 
 ENVS, EPISODE, STAND = 32, 50, 220
+CONFIG = dataclasses.replace(preset("default"), engine="mujoco")
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +33,12 @@ def compiled(make_fleet: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(dataclasses.replace(preset("default"), engine="mujoco"))
+    return load_scene(CONFIG)
 
 
 @pytest.fixture(scope="module")
 def engine(scene: Scene) -> JaxEngine:
-    return make_engine(scene.config, scene)
+    return make_engine(CONFIG, scene)
 
 
 def in_double(tree: Any) -> dict[str, np.ndarray]:
@@ -71,44 +71,15 @@ def test_training_and_evaluation_have_the_same_physics(compiled: Any) -> None:
     assert tilt.max() == pytest.approx(theirs.max(), rel=0.05)
 
 
-def test_the_envs_of_both_engines_agree(fleet: Any, compiled: Any, closed_loop: list[Any]) -> None:
-    """MJX's 10 s, actions and all, repeated: tilt, IMU samples and observations open loop."""
-    state = closed_loop[0]
-    worst = {"tilt": [], "imu": [], "obs": []}
-    for theirs in closed_loop[1:]:
-        state = compiled.step(state, jnp.asarray(theirs.info["action"]))
-        memory = (state.pipeline_state.memory.imu, theirs.pipeline_state.memory.imu)
-        pairs = {
-            "tilt": (state.metrics["tilt_deg"], theirs.metrics["tilt_deg"]),
-            "imu": memory,
-            "obs": (state.obs, theirs.obs),
-        }
-        for name, (a, b) in pairs.items():
-            worst[name].append(np.abs(np.asarray(a) - b)[: ENVS // 2])
-    assert np.percentile(worst["tilt"], 99) < 5e-4
-    assert np.percentile(worst["imu"], 99) < 0.002
-    assert np.percentile(worst["obs"], 99) < 0.002
-    assert fleet.env.observation_size == compiled.env.observation_size
+def random_params(seed: int, count: int) -> DomainParams:
+    """Domain parameters of envs."""
+    uniform = np.random.default_rng(seed).uniform(size=(count, DRAWS)).astype(np.float32)
+    return jax.tree.map(jnp.asarray, draw_params(RANDOM, find_robot("quadruped"), uniform))
 
 
-@pytest.fixture(scope="module")
-def circumstances(fleet_config: Config) -> Callable[[int, int], DomainParams]:
-    """Seed and number of envs -> their circumstances."""
-
-    def draw(seed: int, count: int) -> DomainParams:
-        uniform = np.random.default_rng(seed).uniform(size=(count, 8))
-        robot = load_scene(fleet_config).robot
-        drawn = draw_params(fleet_config.randomization, robot, uniform.astype(np.float32))
-        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), drawn)
-
-    return draw
-
-
-def moved(
-    engine: JaxEngine, state: PhysicsState, ctrl: Any, conditions: DomainParams | None
-) -> Any:
-    axes = (0, 0, None if conditions is None else 0)
-    return jax.device_get(jax.jit(jax.vmap(engine.physics, axes))(state, ctrl, conditions))
+def moved(engine: JaxEngine, state: PhysicsState, ctrl: Any, params: DomainParams | None) -> Any:
+    axes = (0, 0, None if params is None else 0)
+    return jax.device_get(jax.jit(jax.vmap(engine.physics, axes))(state, ctrl, params))
 
 
 def held(engine: JaxEngine, count: int) -> tuple[PhysicsState, jax.Array]:
@@ -121,20 +92,18 @@ def held(engine: JaxEngine, count: int) -> tuple[PhysicsState, jax.Array]:
     return state, jnp.asarray(hold + 0.01 * noise, jnp.float32)
 
 
-def test_a_call_depends_on_its_arguments_alone(
-    fleet: Any, scene: Scene, engine: JaxEngine, circumstances: Any
-) -> None:
-    """Whatever circumstances, numbers of envs and devices were called for before."""
+def test_a_call_depends_on_its_arguments_alone(fleet: Any, scene: Scene, engine: JaxEngine) -> None:
+    """Whatever parameters, numbers of envs and devices were called for before."""
     state, ctrl = held(engine, 6)
-    first, second = circumstances(0, 6), circumstances(1, 6)
+    first, second = random_params(0, 6), random_params(1, 6)
     mixed = jax.tree.map(lambda a, b: a.at[2:4].set(b[2:4]), first, second)
     plain = jax.tree.map(jnp.asarray, fleet.nominal(6))
     cases = [plain, first, plain, second, None, mixed, first, None, second, mixed]
     results: dict[int, Any] = {}
     for case in cases:
-        found = moved(engine, state, ctrl, case)
-        before = results.setdefault(id(case), found)
-        jax.tree.map(np.testing.assert_array_equal, found, before)
+        result = moved(engine, state, ctrl, case)
+        before = results.setdefault(id(case), result)
+        jax.tree.map(np.testing.assert_array_equal, result, before)
     one, two, both = (results[id(case)][0].qpos for case in (first, second, mixed))
     np.testing.assert_array_equal(both[2:4], two[2:4])
     np.testing.assert_array_equal(both[:2], one[:2])
@@ -143,16 +112,14 @@ def test_a_call_depends_on_its_arguments_alone(
     np.testing.assert_array_equal(few[0].qpos, two[1:3])
 
 
-def test_a_decision_is_that_of_the_c_engine(
-    scene: Scene, engine: JaxEngine, circumstances: Any
-) -> None:
+def test_a_decision_is_that_of_the_c_engine(scene: Scene, engine: JaxEngine) -> None:
     """State, IMU and tilt of robots under loads, against the engine that evaluates."""
     state, ctrl = held(engine, 4)
-    conditions = circumstances(0, 4)
-    after, motion = moved(engine, state, ctrl, conditions)
+    params = random_params(0, 4)
+    after, motion = moved(engine, state, ctrl, params)
     plain = MujocoEngine(scene, 4)
     plain.set_state(*(np.asarray(x, float) for x in state))
-    params = DomainParams(**in_double(conditions))
+    params = DomainParams(**in_double(params))
     expected = plain.roll(np.arange(4), np.asarray(ctrl, float), params)
     for name in motion._fields:
         ours, theirs = getattr(motion, name), getattr(expected, name)
@@ -161,32 +128,28 @@ def test_a_decision_is_that_of_the_c_engine(
         np.testing.assert_allclose(getattr(after, name), value, rtol=1e-5, atol=1e-6)
 
 
-def test_seeds_of_envs_are_rows_of_one_batch(
-    scene: Scene, engine: JaxEngine, circumstances: Any
-) -> None:
+def test_seeds_of_envs_are_rows_of_one_batch(scene: Scene, engine: JaxEngine) -> None:
     state, ctrl = held(engine, 6)
-    conditions = circumstances(3, 6)
-    flat = moved(engine, state, ctrl, conditions)
-    split = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), (state, ctrl, conditions))
+    params = random_params(3, 6)
+    flat = moved(engine, state, ctrl, params)
+    split = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), (state, ctrl, params))
     nested = jax.device_get(jax.jit(jax.vmap(jax.vmap(engine.physics)))(*split))
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a.reshape(b.shape), b), nested, flat)
     alone = jax.device_get(
-        jax.jit(engine.physics)(*jax.tree.map(lambda x: x[5], (state, ctrl, conditions)))
+        jax.jit(engine.physics)(*jax.tree.map(lambda x: x[5], (state, ctrl, params)))
     )
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[5]), alone, flat)
 
 
-def test_two_devices_move_their_own_robots(
-    scene: Scene, engine: JaxEngine, circumstances: Any
-) -> None:
+def test_two_devices_move_their_own_robots(scene: Scene, engine: JaxEngine) -> None:
     """Twenty calls at once on both: the boards of each are those of one device."""
     state, ctrl = held(engine, 8)
-    conditions = circumstances(4, 8)
+    params = random_params(4, 8)
     mesh = jax.make_mesh((2,), ("d",), axis_types=(jax.sharding.AxisType.Auto,))
     split = jax.sharding.PartitionSpec("d")
 
-    def many(state: PhysicsState, ctrl: jax.Array, conditions: DomainParams) -> PhysicsState:
-        step = lambda state, _: (jax.vmap(engine.physics)(state, ctrl, conditions)[0], None)  # noqa: E731
+    def many(state: PhysicsState, ctrl: jax.Array, params: DomainParams) -> PhysicsState:
+        step = lambda state, _: (jax.vmap(engine.physics)(state, ctrl, params)[0], None)  # noqa: E731
         return jax.lax.scan(step, state, length=20)[0]
 
     shared = jax.jit(
@@ -194,8 +157,8 @@ def test_two_devices_move_their_own_robots(
     )
     jax.tree.map(
         np.testing.assert_array_equal,
-        jax.device_get(shared(state, ctrl, conditions)),
-        jax.device_get(jax.jit(many)(state, ctrl, conditions)),
+        jax.device_get(shared(state, ctrl, params)),
+        jax.device_get(jax.jit(many)(state, ctrl, params)),
     )
 
 
@@ -287,14 +250,13 @@ def test_host_functions_see_the_buffers_themselves() -> None:
 def test_an_env_says_which_engine_it_has(compiled: Any) -> None:
     assert compiled.env.backend == "mujoco"
     assert BalanceEnv().backend == "mjx"
-    assert MODEL_PARAMS == ("payload", "payload_at", "friction", "gain")
 
 
 def test_engines_of_other_threads_have_other_names(scene: Scene) -> None:
     """A second env of the scene, over more devices, does not get the first one's threads."""
     before = set(ffi.registered())
     for devices in (1, 2):
-        make_engine(dataclasses.replace(scene.config, num_devices=devices), scene)
+        make_engine(dataclasses.replace(CONFIG, num_devices=devices), scene)
     threads = {max(1, cores() // devices) for devices in (1, 2)}
     ours = {f"mjx_balance.{scene.hash}.{count}" for count in threads}
     assert ours <= set(ffi.registered())

@@ -141,7 +141,7 @@ def test_both_engines_balance_alike_to_the_end(courses: tuple[Course, Course]) -
 
 
 def test_feedback_is_what_keeps_the_robots_up(courses: tuple[Course, Course]) -> None:
-    """The circumstances matter: the late and loaded half tilts more than the nominal one."""
+    """Domain parameters matter: the delayed and loaded half tilts more than the nominal one."""
     tilt = courses[1].tilt
     assert tilt[:, ENVS // 2 :].mean() > 1.3 * tilt[:, : ENVS // 2].mean()
 
@@ -260,13 +260,13 @@ def test_c_engine_warns_of_the_robot_that_diverges_alone(scene: Scene) -> None:
             assert np.isfinite(values[0]).all()
 
 
-def test_circumstances_are_those_of_models_made_so(scene: Scene) -> None:
+def test_domain_parameters_are_those_of_models_made_so(scene: Scene) -> None:
     """Payload as a body of its own, other servos and soles: compiled by MuJoCo, stepped by it.
 
     The first load sits on the trunk's axis. The second does not, and the products of inertia
     that are left out show a little.
     """
-    conditions = DomainParams(
+    params = DomainParams(
         imu_noise=np.zeros((2, 6)),
         payload=np.asarray((3.0, 5.0)),
         payload_at=np.asarray(((0.0, 0.0, 0.1), (0.05, -0.04, 0.08))),
@@ -280,12 +280,12 @@ def test_circumstances_are_those_of_models_made_so(scene: Scene) -> None:
     ctrl = np.tile(hold, (2, 150, 1))
     turning = 0.00025 * np.arange(150)[:, None]  # 3.6 deg/s
     ctrl[:, :, scene.board_ctrl] = turning * (1.0, -0.7)
-    engine.roll(np.arange(2), ctrl, conditions)
+    engine.roll(np.arange(2), ctrl, params)
     path_of = engine.recorded["qpos"]
     for k, most in ((0, 1e-7), (1, 2e-4)):
         model = loaded_model(
             scene,
-            *(np.asarray(x)[k] for x in conditions[1:5]),  # load, at, friction, gain
+            *(np.asarray(x)[k] for x in params[1:5]),  # load, at, friction, gain
         )
         data = mujoco.MjData(model)
         data.qpos, data.qvel = scene.stance.qpos, scene.stance.qvel

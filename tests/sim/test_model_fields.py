@@ -2,17 +2,17 @@
 
 import types
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import RandomizationConfig, preset
-from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.domain_randomization import randomized_fields
 from mjx_balance.sim.scene import Scene, load_scene
-from mjx_balance.task.randomization import DRAWS, draw_params
+from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
 
 WORST = RandomizationConfig(payload=8.0, payload_offset=0.1, friction_min=0.3, gain_spread=0.3)
 
@@ -55,23 +55,52 @@ def test_a_payload_by_full_tensors_in_the_trunks_own_axes() -> None:
     for weight, place in ((mass, trunk.ipos), (added, at)):
         arm = place - centre
         whole = whole + weight * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    got = randomized_fields(scene, load)["body_inertia"][trunk.id]
-    np.testing.assert_allclose(got, np.diag(axes.T @ whole @ axes), rtol=1e-9)
+    got = randomized_fields(scene, load)
+    principal = np.diag(axes.T @ whole @ axes)
+    np.testing.assert_allclose(got["body_inertia"][trunk.id], principal, rtol=1e-9)
+    np.testing.assert_allclose(got["body_mass"][trunk.id], mass + added)
+    np.testing.assert_allclose(got["body_ipos"][trunk.id], centre, atol=1e-12)
 
 
-def test_without_a_payload_nothing_changes(any_scene: Scene) -> None:
-    scene, robot = any_scene, any_scene.robot
-    uniform = np.full((1, DRAWS), 0.5)
-    fields = randomized_fields(scene, draw_params(RandomizationConfig(), robot, uniform))
-    for name, values in fields.items():
-        before = getattr(scene.model, name)
-        assert values.shape == (1, *before.shape), name
-        np.testing.assert_allclose(values[0], before, rtol=1e-9, atol=1e-12, err_msg=name)
+def three_envs(xp: types.ModuleType = np) -> DomainParams:
+    """Nominal; loaded off the centre; loaded on the axis, weak and slippery."""
+    return DomainParams(
+        imu_noise=xp.zeros((3, 6)),
+        payload=xp.asarray((0.0, 4.0, 2.5)),
+        payload_at=xp.asarray(((0.01, 0.02, 0.03), (0.05, -0.04, 0.08), (0.0, 0.0, 0.1))),
+        friction=xp.asarray((0.8, 0.4, 0.6)),
+        gain=xp.asarray((1.0, 1.1, 0.8)),
+        delay=xp.zeros(3),
+    )
 
 
-def test_one_robot_and_a_batch_of_one_agree(robot: Robot, scene: Scene) -> None:
-    uniform = np.random.default_rng(1).uniform(size=DRAWS)
-    one = randomized_fields(scene, draw_params(WORST, robot, uniform))
-    many = randomized_fields(scene, draw_params(WORST, robot, uniform[None]))
-    for name, values in one.items():
-        assert values == pytest.approx(many[name][0]), name
+def test_friction_and_gain_reach_every_foot_and_leg_and_nothing_else(scene: Scene) -> None:
+    model, fields = scene.model, randomized_fields(scene, three_envs())
+    legs, board = scene.leg_ctrl.ravel(), scene.board_ctrl
+    for k, (friction, gain) in enumerate(((0.8, 400.0), (0.4, 440.0), (0.6, 320.0))):
+        rows = [(friction, friction, 0.005, 0.0001, 0.0001)] * 4
+        np.testing.assert_allclose(fields["pair_friction"][k], rows)
+        np.testing.assert_allclose(fields["actuator_gainprm"][k, legs, 0], gain)
+        np.testing.assert_allclose(fields["actuator_biasprm"][k, legs, 1], -gain)
+        for name in ("actuator_gainprm", "actuator_biasprm"):
+            ours, nominal = fields[name][k].copy(), getattr(model, name)
+            np.testing.assert_array_equal(ours[board], nominal[board])
+            np.testing.assert_array_equal(ours[:, 2:], nominal[:, 2:])
+    trunk = model.body("robot/trunk").id
+    for name in ("body_mass", "body_ipos", "body_inertia"):
+        ours, nominal = fields[name], getattr(model, name)
+        others = np.arange(model.nbody) != trunk
+        np.testing.assert_array_equal(ours[:, others], np.stack([nominal[others]] * 3))
+
+
+def test_nominal_params_are_the_model(xp: types.ModuleType, scene: Scene) -> None:
+    for name, values in randomized_fields(scene, three_envs(xp)).items():
+        assert values.shape == (3, *getattr(scene.model, name).shape)
+        np.testing.assert_allclose(values[0], getattr(scene.model, name), rtol=1e-6, atol=1e-9)
+
+
+def test_one_env_in_jax_equals_its_row_in_numpy(scene: Scene) -> None:
+    alone = DomainParams(*(jnp.asarray(x[1]) for x in three_envs()))
+    whole = randomized_fields(scene, three_envs())
+    for name, values in randomized_fields(scene, alone).items():
+        np.testing.assert_allclose(values, whole[name][1], rtol=1e-5, atol=1e-8, err_msg=name)

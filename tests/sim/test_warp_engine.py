@@ -59,11 +59,11 @@ def test_training_and_evaluation_have_the_same_physics(warped: Any) -> None:
 
 @pytest.mark.parametrize(("contacts", "rows"), [(2, 24), (4, 8)])
 def test_a_full_buffer_is_an_error(
-    contacts: int, rows: int, monkeypatch: pytest.MonkeyPatch, scene: Scene
+    contacts: int, rows: int, monkeypatch: pytest.MonkeyPatch, warped: Any, scene: Scene
 ) -> None:
     """A contact that finds no room would be dropped: the robot would sink, and train on."""
     monkeypatch.setattr(warp, "contact_room", lambda model: (contacts, rows))
-    engine = make_engine(scene.config, scene)
+    engine = make_engine(warped.env.config, scene)
     physics = jax.jit(jax.vmap(engine.physics))
     state = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), engine.initial())
     hold = np.zeros((2, 3, scene.model.nu), np.float32)
@@ -100,11 +100,11 @@ def test_buffers_hold_every_foot_on_the_board(scene: Scene) -> None:
 
 
 def test_an_engine_that_is_not_installed_is_refused(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
+    warped: Any, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *a: None if name == "warp" else found(name, *a)
     )
     with pytest.raises(ConfigError, match="engine is warp, and warp-lang is not installed; inst"):
-        make_engine(scene.config, scene)
+        make_engine(warped.env.config, scene)

@@ -36,16 +36,6 @@ def observed(task: TaskConfig, robot: Robot, *signals: Any) -> Any:
     return observe(input_rows(task, robot), Signals(*signals))
 
 
-def test_every_entry_by_hand(xp: types.ModuleType, robot: Robot) -> None:
-    """Channels 0 and 1 are the gyro's x and y, 3 and 4 the accelerometer's; 15 is now."""
-    got = observed(UNSCALED, robot, *map(xp.asarray, (HEIGHTS, COMMANDS, readable_history())))
-    gyro_lagged = np.asarray([15, 14, 13, 12, 11, 10])
-    accel_lagged = np.asarray([15, 13, 11, 9, 7, 5, 3, 1, 0])
-    expected = [[0.001, 0.002, 0.003, 0.004], gyro_lagged, 100 + gyro_lagged]
-    expected += [300 + accel_lagged, 400 + accel_lagged]
-    np.testing.assert_allclose(got, np.concatenate(expected), atol=1e-6)
-
-
 def test_commands_and_means_by_hand(xp: types.ModuleType, robot: Robot) -> None:
     """Samples k read k: the mean of 15, 14 and 13 is 14, that of 11, 10 and 9 is 10.
 

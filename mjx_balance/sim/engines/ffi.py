@@ -8,7 +8,8 @@ interface is handed the buffers themselves. This is its C interface (xla/ffi/api
 
 import ctypes
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from ctypes import POINTER, c_char_p, c_int, c_int64, c_size_t, c_void_p
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,108 +22,60 @@ FLOAT32 = 11
 """`XLA_FFI_DataType_F32`."""
 
 
-class _Extension(ctypes.Structure):
-    """`XLA_FFI_Metadata_Extension`; only its beginning, if it is another extension."""
+def _struct(name: str, **fields: Any) -> Any:
+    """A C structure of XLA; all of them begin with their size."""
+    every = [("struct_size", c_size_t), *fields.items()]
+    return type(name, (ctypes.Structure,), {"_fields_": every})
 
 
-class _Version(ctypes.Structure):
-    """`XLA_FFI_Api_Version`."""
-
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("major", ctypes.c_int),
-        ("minor", ctypes.c_int),
-    )
-
-
-class _Metadata(ctypes.Structure):
-    """`XLA_FFI_Metadata`, without what follows the version."""
-
-    _fields_ = (("struct_size", ctypes.c_size_t), ("version", _Version))
-
-
-_Extension._fields_ = (
-    ("struct_size", ctypes.c_size_t),
-    ("type", ctypes.c_int),
-    ("next", ctypes.c_void_p),
-    ("metadata", ctypes.POINTER(_Metadata)),
+_Version = _struct("XLA_FFI_Api_Version", extension=c_void_p, major=c_int, minor=c_int)
+# Without what follows the version.
+_Metadata = _struct("XLA_FFI_Metadata", version=_Version)
+# Only its beginning, if it is another extension.
+_Extension = _struct(
+    "XLA_FFI_Metadata_Extension", type=c_int, next=c_void_p, metadata=POINTER(_Metadata)
 )
+_ErrorArguments = _struct(
+    "XLA_FFI_Error_Create_Args", extension=c_void_p, message=c_char_p, code=c_int
+)
+# As far as the constructor of errors.
+_Api = _struct(
+    "XLA_FFI_Api",
+    extension=c_void_p,
+    version=_Version,
+    internal=c_void_p,
+    make_error=ctypes.CFUNCTYPE(c_void_p, POINTER(_ErrorArguments)),
+)
+_Buffer = _struct(
+    "XLA_FFI_Buffer",
+    extension=c_void_p,
+    dtype=c_int,
+    data=c_void_p,
+    rank=c_int64,
+    dims=POINTER(c_int64),
+)
+# Has the shape of `XLA_FFI_Rets`, too.
+_Buffers = _struct(
+    "XLA_FFI_Args",
+    extension=c_void_p,
+    size=c_int64,
+    types=c_void_p,
+    buffers=POINTER(POINTER(_Buffer)),
+)
+# As far as its results.
+_Frame = _struct(
+    "XLA_FFI_CallFrame",
+    extension=POINTER(_Extension),
+    api=POINTER(_Api),
+    context=c_void_p,
+    stage=c_int,
+    arguments=_Buffers,
+    results=_Buffers,
+)
+_HANDLER = ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
 
-
-class _ErrorArguments(ctypes.Structure):
-    """`XLA_FFI_Error_Create_Args`."""
-
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("message", ctypes.c_char_p),
-        ("code", ctypes.c_int),
-    )
-
-
-class _Api(ctypes.Structure):
-    """`XLA_FFI_Api`, as far as the constructor of errors."""
-
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("version", _Version),
-        ("internal", ctypes.c_void_p),
-        ("make_error", ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArguments))),
-    )
-
-
-class _Buffer(ctypes.Structure):
-    """`XLA_FFI_Buffer`."""
-
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("dtype", ctypes.c_int),
-        ("data", ctypes.c_void_p),
-        ("rank", ctypes.c_int64),
-        ("dims", ctypes.POINTER(ctypes.c_int64)),
-    )
-
-
-class _Buffers(ctypes.Structure):
-    """`XLA_FFI_Args` and `XLA_FFI_Rets`."""
-
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("size", ctypes.c_int64),
-        ("types", ctypes.c_void_p),
-        ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))),
-    )
-
-
-class _Frame(ctypes.Structure):
-    """`XLA_FFI_CallFrame`, as far as its results."""
-
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.POINTER(_Extension)),
-        ("api", ctypes.POINTER(_Api)),
-        ("context", ctypes.c_void_p),
-        ("stage", ctypes.c_int),
-        ("arguments", _Buffers),
-        ("results", _Buffers),
-    )
-
-
-_HANDLER = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
-
-
-class _Target(NamedTuple):
-    """A registered function, kept alive for as long as a program may call it."""
-
-    handler: Any
-    capsule: Any
-
-
-_TARGETS: dict[str, _Target] = {}
+_TARGETS: dict[str, tuple[Any, Any]] = {}
+"""Handlers and capsules, kept alive for as long as a program may call them."""
 
 HostFunction = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
 """(arguments, results to be written), float32 arrays; they are gone once it returns."""
@@ -155,9 +108,9 @@ def register(name: str, function: HostFunction) -> None:
         return None
 
     handler = _HANDLER(handle)
-    capsule = jax.ffi.pycapsule(ctypes.cast(handler, ctypes.c_void_p).value)
+    capsule = jax.ffi.pycapsule(ctypes.cast(handler, c_void_p).value)
     jax.ffi.register_ffi_target(name, capsule, platform="cpu")
-    _TARGETS[name] = _Target(handler, capsule)
+    _TARGETS[name] = handler, capsule
 
 
 def registered() -> list[str]:
@@ -165,7 +118,7 @@ def registered() -> list[str]:
     return list(_TARGETS)
 
 
-def _arrays(buffers: _Buffers) -> list[np.ndarray]:
+def _arrays(buffers: Any) -> list[np.ndarray]:
     """The float32 buffers of a call as NumPy arrays over the same memory."""
     arrays = []
     for k in range(buffers.size):

@@ -1,10 +1,12 @@
 """A physics engine inside a jitted program, for one env: `jax.vmap` it over thousands."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.randomization import DomainParams
@@ -17,27 +19,18 @@ class PhysicsState(NamedTuple):
     Holds only what a physics step reads, so that it is cheap to carry, to reset and to save.
     """
 
-    qpos: jax.Array
-    """(nq,)"""
-    qvel: jax.Array
-    """(nv,)"""
-    qacc_warmstart: jax.Array
-    """(nv,)"""
+    qpos: Float[jax.Array, " nq"]
+    qvel: Float[jax.Array, " nv"]
+    qacc_warmstart: Float[jax.Array, " nv"]
 
 
-Physics = Callable[
-    [PhysicsState, jax.Array, DomainParams | None],
-    tuple[PhysicsState, Motion],
-]
-"""Moves one env by one decision: (state, ctrl (sim_steps, nu), params) -> (state, motion)."""
-
-
+@dataclasses.dataclass(frozen=True, eq=False)
 class JaxEngine:
     """`task.step.Engine` over a function of MuJoCo's own arrays."""
 
-    def __init__(self, scene: Scene, physics: Physics):
-        """Of a scene, whose order of servos the function takes."""
-        self.scene, self.physics = scene, physics
+    scene: Scene
+    physics: Callable[[PhysicsState, jax.Array, DomainParams | None], tuple[PhysicsState, Motion]]
+    """State, ctrl (sim_steps, nu) in the scene's order of servos, params -> state, motion."""
 
     def initial(self) -> PhysicsState:
         """The settled stance."""
@@ -45,8 +38,8 @@ class JaxEngine:
         parts = (stance.qpos, stance.qvel, stance.qacc_warmstart)
         return PhysicsState(*(jnp.asarray(part, jnp.float32) for part in parts))
 
-    def push(self, physics: PhysicsState, velocity: jax.Array) -> PhysicsState:
-        """Adds (2,) m/s along the world's x and y to the trunk's velocity."""
+    def push(self, physics: PhysicsState, velocity: Float[jax.Array, "2"]) -> PhysicsState:
+        """Adds m/s along the world's x and y to the trunk's velocity."""
         return physics._replace(qvel=physics.qvel.at[self.scene.trunk_velocity].add(velocity))
 
     def advance(

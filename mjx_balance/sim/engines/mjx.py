@@ -5,6 +5,7 @@ import functools
 
 import jax
 import mujoco
+from jaxtyping import Float
 from mujoco import mjx
 
 from mjx_balance.sim.domain_randomization import randomized_fields
@@ -27,19 +28,15 @@ def training_model(scene: Scene, options: Options) -> mujoco.MjModel:
 
 
 def physics_step(
-    scene: Scene, model: mjx.Model, blank: mjx.Data, state: PhysicsState, ctrl: jax.Array
+    scene: Scene,
+    model: mjx.Model,
+    blank: mjx.Data,
+    state: PhysicsState,
+    ctrl: Float[jax.Array, " nu"],
 ) -> tuple[PhysicsState, Motion, mjx.Data]:
-    """One physics step of one env.
+    """One physics step of one env, whose state is put into `blank` data.
 
-    Args:
-      scene: what is measured where.
-      model: of this env.
-      blank: data to put the state into.
-      state: before.
-      ctrl: (nu,) servo targets, rad.
-
-    Returns:
-      The state after it, the motion (without the axis of steps), and all of MJX's data.
+    Returns the state after it, the motion (without the axis of steps), and all of MJX's data.
     """
     data = blank.replace(**state._asdict(), ctrl=ctrl)
     # TF32 matrix products, the default on recent GPUs, are too coarse for contacts.
@@ -63,12 +60,8 @@ def mjx_engine(scene: Scene, options: Options) -> JaxEngine:
     ) -> tuple[PhysicsState, Motion]:
         fields = {} if params is None else randomized_fields(scene, params)
         model, blank = on_device()
-        env_model = model.replace(**fields)
-
-        def body(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Motion]:
-            state, motion, _ = physics_step(scene, env_model, blank, state, ctrl)
-            return state, motion
-
-        return jax.lax.scan(body, state, ctrl)
+        own = model.replace(**fields)
+        step = lambda state, ctrl: physics_step(scene, own, blank, state, ctrl)[:2]  # noqa: E731
+        return jax.lax.scan(step, state, ctrl)
 
     return JaxEngine(scene, physics)

@@ -4,6 +4,7 @@ Runs as MuJoCo ships it: float64, default solver accuracy.
 """
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from mujoco.batch import Batch
 
 from mjx_balance.machine import cores
@@ -13,21 +14,18 @@ from mjx_balance.sim.scene import Scene
 from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.step import Motion, Targets
 
+Ids = Int[np.ndarray, " n"]
+"""Envs of a batch."""
+
 
 class MujocoEngine:
     """`task.step.Engine` over a batch of envs of one scene, whose states it owns.
 
-    Its `physics` are ids (n,) of envs.
+    Its `physics` are ids of envs.
     """
 
     def __init__(self, scene: Scene, count: int, threads: int | None = None):
-        """Puts `count` robots into the settled stance.
-
-        Args:
-          scene: model and stance.
-          count: envs.
-          threads: worker threads; None: all cores.
-        """
+        """Puts `count` robots into the settled stance; `threads` None: all cores."""
         self.scene = scene
         self.recorded: dict[str, np.ndarray] = {}
         """`RECORDED` fields (n, sim_steps, ...) of the last decision."""
@@ -35,8 +33,8 @@ class MujocoEngine:
         self._params = np.full((count, 6), np.nan)
         self.reset(np.arange(count))
 
-    def reset(self, ids: np.ndarray) -> None:
-        """Puts envs `ids` (n,) back into the settled stance."""
+    def reset(self, ids: Ids) -> None:
+        """Puts envs back into the settled stance."""
         stance = self.scene.stance
         self._batch.qpos[ids], self._batch.qvel[ids] = stance.qpos, stance.qvel
         self._batch.qacc_warmstart[ids] = stance.qacc_warmstart
@@ -52,25 +50,21 @@ class MujocoEngine:
         """What `set_state` takes, of all envs."""
         return self._batch.qpos, self._batch.qvel, self._batch.qacc_warmstart
 
-    def push(self, physics: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Adds (n, 2) m/s along the world's x and y to the trunks' velocity."""
+    def push(self, physics: Ids, velocity: Float[np.ndarray, "n 2"]) -> Ids:
+        """Adds m/s along the world's x and y to the trunks' velocity."""
         self._batch.qvel[physics[:, None], self.scene.trunk_velocity] += velocity
         return physics
 
     def advance(
-        self, physics: np.ndarray, targets: Targets, params: DomainParams | None
-    ) -> tuple[np.ndarray, Motion]:
-        """Moves envs (n,) by one decision.
-
-        Args:
-          physics: ids (n,).
-          targets: servo targets (n, sim_steps, ...).
-          params: (n,) of these envs; None: nominal. An env that has had some always needs some.
-        """
+        self, physics: Ids, targets: Targets, params: DomainParams | None
+    ) -> tuple[Ids, Motion]:
+        """Moves envs by one decision. An env that has had `params` always needs some."""
         return physics, self.roll(physics, self.scene.ctrl(targets), params)
 
-    def roll(self, ids: np.ndarray, ctrl: np.ndarray, params: DomainParams | None) -> Motion:
-        """`advance` for servo targets (n, sim_steps, nu) in the model's order, rad."""
+    def roll(
+        self, ids: Ids, ctrl: Float[np.ndarray, "n sim_steps nu"], params: DomainParams | None
+    ) -> Motion:
+        """`advance` for servo targets in the model's order, rad."""
         if params is not None:
             self._randomize(ids, params)
         out = self._batch.rollout(ctrl.shape[1], ctrl, record=RECORDED, ids=ids)
@@ -82,12 +76,12 @@ class MujocoEngine:
                 values[warned] = np.nan
         return motion
 
-    def changed(self, ids: np.ndarray, params: DomainParams) -> np.ndarray:
-        """(n,) whether the model of envs `ids` has other parameters than `params` (n,)."""
+    def changed(self, ids: Ids, params: DomainParams) -> Bool[np.ndarray, " n"]:
+        """Whether the model of envs has other parameters than `params`."""
         return (self._params[ids] != _columns(params)).any(axis=1)
 
-    def _randomize(self, ids: np.ndarray, params: DomainParams) -> None:
-        """Gives envs (n,) their parameters (n,); from decision to decision few change."""
+    def _randomize(self, ids: Ids, params: DomainParams) -> None:
+        """Gives envs their parameters; from decision to decision few change."""
         changed = self.changed(ids, params)
         if not changed.any():
             return
@@ -98,8 +92,8 @@ class MujocoEngine:
         self._params[ids] = _columns(params)
 
 
-def _columns(params: DomainParams) -> np.ndarray:
-    """(n, 6) those that change the model."""
+def _columns(params: DomainParams) -> Float[np.ndarray, "n 6"]:
+    """Those that change the model."""
     count = len(params.payload)
     values = [np.reshape(getattr(params, name), (count, -1)) for name in MODEL_PARAMS]
     return np.concatenate(values, axis=1)

@@ -58,19 +58,15 @@ def mujoco_engine(scene: Scene, options: Options) -> JaxEngine:
 
 
 class _Pool:
-    """Owns as many C engines of a scene as are needed at once."""
+    """Owns as many C engines of a scene, each of `threads` threads, as are needed at once."""
 
     def __init__(self, scene: Scene, threads: int):
-        """Each of them gets `threads` threads."""
         self.scene, self.threads = scene, threads
         self._free: dict[tuple[int, bool], list[MujocoEngine]] = collections.defaultdict(list)
         self._lock = threading.Lock()
 
     def advance(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        """The host function: state, ctrl and parameters -> state and motion.
-
-        All arrays have the same leading axes (...), those of the envs.
-        """
+        """The host function: state, ctrl and parameters -> state and motion, of envs (...)."""
         batch = arguments[0].shape[:-1]
         count = int(np.prod(batch))
         flat = [x.reshape(count, *x.shape[len(batch) :]) for x in arguments]
@@ -103,7 +99,7 @@ class _Pool:
 
 
 def _params(values: Sequence[np.ndarray]) -> DomainParams | None:
-    """Parameters (count,) of `MODEL_PARAMS`; the others are not the engine's."""
+    """Parameters from the values of `MODEL_PARAMS`; the others are not the engine's."""
     if not values:
         return None
     count = len(values[0])

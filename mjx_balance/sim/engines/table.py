@@ -5,7 +5,7 @@ name in `Config.engine`.
 """
 
 import importlib.util
-from collections.abc import Callable
+import pkgutil
 from typing import TYPE_CHECKING, NamedTuple
 
 from mjx_balance.config import Config, ConfigError
@@ -30,52 +30,32 @@ class EngineRow(NamedTuple):
 
     name: str
     """As in `Config.engine`."""
-    make: Callable[[Scene, Options], "JaxEngine"]
-    """Imports the engine on its first call."""
+    make: str
+    """`MODULE:FUNCTION` of this folder, (scene, options) -> `JaxEngine`; imported when called."""
     platforms: tuple[str, ...] = ()
     """JAX platforms that it runs on; none named: all."""
     hardware: str = "every device"
     """The same in words."""
     cacheable: bool = True
     """Whether its traced programs work in another process."""
-    extra: str | None = None
-    """Extra of this package that installs it; none: the extra `train`."""
     module: str | None = None
-    """What that extra brings, hidden from imports while another engine runs."""
+    """What the extra called as the engine brings, hidden from imports while another engine runs;
+    none: the extra `train` is enough."""
     distribution: str | None = None
     """The registry's name of that module."""
-
-
-def _mjx(scene: Scene, options: Options) -> "JaxEngine":
-    from mjx_balance.sim.engines.mjx import mjx_engine
-
-    return mjx_engine(scene, options)
-
-
-def _mujoco(scene: Scene, options: Options) -> "JaxEngine":
-    from mjx_balance.sim.engines.mujoco_ffi import mujoco_engine
-
-    return mujoco_engine(scene, options)
-
-
-def _warp(scene: Scene, options: Options) -> "JaxEngine":
-    from mjx_balance.sim.engines.warp import warp_engine
-
-    return warp_engine(scene, options)
 
 
 ENGINES = {
     row.name: row
     for row in (
-        EngineRow("mjx", _mjx),
-        EngineRow("mujoco", _mujoco, platforms=("cpu",), hardware="CPUs"),
+        EngineRow("mjx", "mjx:mjx_engine"),
+        EngineRow("mujoco", "mujoco_ffi:mujoco_engine", platforms=("cpu",), hardware="CPUs"),
         EngineRow(
             "warp",
-            _warp,
+            "warp:warp_engine",
             platforms=("cpu", "gpu", "cuda"),
             hardware="NVIDIA GPUs and CPUs",
             cacheable=False,  # its kernels live in the process that built them
-            extra="warp",
             module="warp",
             distribution="warp-lang",
         ),
@@ -95,10 +75,10 @@ def make_engine(config: Config, scene: Scene) -> "JaxEngine":
     if row.module is not None and importlib.util.find_spec(row.module) is None:
         raise ConfigError(
             f"engine is {row.name}, and {row.distribution} is not installed; install the extra "
-            f"`{row.extra}` (make train EXTRAS={row.extra}), or choose engine mjx"
+            f"`{row.name}` (make train EXTRAS={row.name}), or choose engine mjx"
         )
     options = Options(config.solver_iterations, config.line_search_iterations, config.num_devices)
-    return row.make(scene, options)
+    return pkgutil.resolve_name(f"{__package__}.{row.make}")(scene, options)
 
 
 def check_platform(engine: str, platform: str, device_kind: str) -> None:

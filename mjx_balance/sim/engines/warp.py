@@ -46,12 +46,8 @@ def over_all_envs(function: Callable[..., T]) -> Callable[..., T]:
     """Runs a function of a batch once for all envs, however they are vmapped.
 
     Warp's buffers are shared by all envs of a call, so that it must know how many there are.
-
-    Args:
-      function: of pytrees whose leaves have a leading axis of envs, which they share.
-
-    Returns:
-      The same function; `jax.vmap` of it, once or several times, is one call with more envs.
+    The leaves of the function's arguments share a leading axis of envs. `jax.vmap` of the result,
+    once or several times, is one call with more envs.
     """
 
     @custom_vmap
