@@ -5,12 +5,7 @@ MESSAGE = 300
 
 
 def shorten(text: object, limit: int = 80) -> str:
-    """Returns text in one line of at most `limit` characters, without control characters.
-
-    Args:
-      text: any object; its `str` counts.
-      limit: greatest length; longer text ends in "...".
-    """
+    """Returns `str(text)` in one line of at most `limit` characters; "..." ends longer text."""
     line = " ".join(str(text)[: 4 * limit].split())
     line = "".join(letter if letter.isprintable() else "?" for letter in line)
     cut = len(line) > limit or len(str(text)) > 4 * limit

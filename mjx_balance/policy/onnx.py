@@ -28,18 +28,7 @@ ABOUT = (
 
 
 def export_onnx(policy: Policy, path: Path) -> int:
-    """Writes a policy as an ONNX model, atomically.
-
-    Args:
-      policy: with any head.
-      path: file to write.
-
-    Returns:
-      Size of the file, bytes.
-
-    Raises:
-      OSError: if it cannot be written; an old file then stays.
-    """
+    """Writes a policy as an ONNX model, atomically; returns the file's size, bytes."""
     content = onnx_model(policy).SerializeToString()
     write_atomically(path, content)
     return len(content)

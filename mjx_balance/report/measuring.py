@@ -66,12 +66,8 @@ def load_or_measure(
 ) -> Measurements:
     """Measures policy and baselines, or reads an earlier result of the same measurement.
 
-    Args:
-      policy: has the name `policy` in the results.
-      scene: the policy's.
-      file: JSON file that stores the result; missing, damaged or outdated ones are replaced.
-      scenarios: per suite and controller.
-      progress: title -> context manager that gives a callable taking the share done.
+    The JSON file of the result is replaced if it is damaged or outdated. `scenarios` is per suite
+    and controller; `progress` maps a title to a context that gives a callable for the share done.
     """
     key = [policy.fingerprint, to_dict(policy.config), scene.hash, code_digest()]
     key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
@@ -86,12 +82,7 @@ def load_or_measure(
 
 
 def parse_measurements(saved: dict[str, Any]) -> Measurements:
-    """Checks a stored result, JSON of `Measurements`, value by value.
-
-    Raises:
-      ReportError: for an invalid value.
-      KeyError: for a missing one.
-    """
+    """Checks a stored result; raises `ReportError`, or KeyError for a missing value."""
     results, shares = saved["results"], parse(_Shares, saved["shares"], ReportError)
     cells = parse(Envelope, saved["envelope"], ReportError)
     for grid in (cells.fall_rate, cells.mean_tilt):
@@ -130,13 +121,7 @@ def _measure(
 def record_rollout(
     policy: Policy, suite: str, duration: float, seed: int, controller: str = "policy"
 ) -> Rollout:
-    """Runs one scenario of `duration` s and records every state, for a figure or a video.
-
-    The controller is `policy`, or the name of a baseline to run in its place.
-
-    Raises:
-      PolicyError: if the policy belongs to another scene.
-    """
+    """Records one scenario of `duration` s of the policy or a baseline; as `policy_scene`."""
     scene = policy_scene(policy)
     acting = _controller(controller, policy, scene)
     return run_suite(scene, acting, suite, 1, duration, seed, record=True)

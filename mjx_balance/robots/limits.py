@@ -9,14 +9,11 @@ from mjx_balance.robots.robot import Robot
 
 
 def for_robot(config: Config, robot: str) -> Config:
-    """Adapts a config of our own robot to another robot.
+    """Adapts a config of our own robot to another one; raises `ConfigError` if there is none.
 
     Standing height and greatest height change become the robot's (`robots.measure`). Payloads scale
     with its mass; pushes, offsets and the scale of foot heights with its size. Angles, board rate
     and fall limit stay.
-
-    Raises:
-      ConfigError: if there is no such robot.
     """
     own = find_robot(robot)
     task = dataclasses.replace(
@@ -52,11 +49,7 @@ def authority(task: TaskConfig, robot: Robot) -> float:
 
 
 def check_robot(config: Config, robot: Robot) -> Config:
-    """Returns `config` if the robot can do what it demands; `config.check` comes before.
-
-    Raises:
-      ConfigError: names the field, its value and the robot.
-    """
+    """Returns a checked config if the robot can do what it demands; else raises `ConfigError`."""
     task, ranges = config.task, config.randomization
     lowest, highest = robot.height_range
     limit = greatest_incline(task, robot)

@@ -93,12 +93,7 @@ def scopes(program: str) -> dict[str, str]:
 
 
 def shares(folder: Path, belongs: Mapping[str, str]) -> dict[str, float]:
-    """Shares of a traced call's time on its first device, the largest first; their sum is 1.
-
-    Args:
-      folder: with the trace.
-      belongs: from `scopes`.
-    """
+    """Shares by scope of a traced call's time on its first device, the largest first; sum 1."""
     timelines = list(_timelines(folder))
     events = [event for timeline in timelines for event in timeline]
     if not events:
