@@ -92,8 +92,8 @@ class BalanceEnv(Env):
             info["noise_key"] = key_noise
         due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
         if len(due):
-            uniform = jax.random.uniform(key_pushes, (len(due), 2))
-            pushes = Pushes(draw_velocity(ranges, uniform), jnp.asarray(due, jnp.int32))
+            draws = jax.random.uniform(key_pushes, (len(due), 2))
+            pushes = Pushes(draw_velocity(ranges, draws), jnp.asarray(due, jnp.int32))
         keys = iter(jax.random.split(rng, 4))
 
         def uniform(shape: tuple[int, ...], low: float, high: float) -> jax.Array:

@@ -124,7 +124,9 @@ class _Balance:
             array = None
         if array is None or array.dtype.kind not in kinds or not space.contains(array):
             raise InvalidAction(f"{self._invalid(action, array)}; it must be in {space}")
-        return self.config.task.action_max * array if self._table is None else self._table[array]
+        if self._table is None:
+            return self.config.task.action_max * array
+        return self._table[array.astype(int)]
 
     def _invalid(self, action: Any, array: np.ndarray | None) -> str:
         """Names an action outside its space, or the first of several."""
