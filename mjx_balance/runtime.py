@@ -62,12 +62,9 @@ class State(str, enum.Enum):
 
     __str__ = str.__str__
 
-    STANDING = "standing"
-    """Before the first sample; the targets are those of the standing robot."""
-    BALANCING = "balancing"
-    """The policy controls the robot."""
-    HOLDING = "holding"
-    """The targets stay the same until `reset`."""
+    STANDING = "standing"  #: before the first sample; the targets are those of the standing robot
+    BALANCING = "balancing"  #: the policy controls the robot
+    HOLDING = "holding"  #: the targets stay the same until `reset`
 
 
 class _Unsafe(Exception):
@@ -146,10 +143,8 @@ class Controller:
     def reset(self) -> None:
         """Starts again; the robot must stand still at its standing height."""
         self.state = State.STANDING
-        self.reason = ""
-        """The reason for holding, in a sentence."""
-        self.action: int | None = None
-        """Index of the last action."""
+        self.reason = ""  #: the reason for holding, in a sentence
+        self.action: int | None = None  #: index of the last action
         self._commands[:] = self._height
         self._path = self._legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]

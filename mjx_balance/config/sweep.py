@@ -12,8 +12,7 @@ SWEEPABLE = (
     *("epsilon_start", "epsilon_end", "epsilon_decay_steps"),
 )
 """Fields of `DQNConfig` that may be arrays: they change no shape and no control flow."""
-WHOLE = ("epsilon_decay_steps",)
-"""Integer fields among them."""
+WHOLE = ("epsilon_decay_steps",)  #: integer fields among them
 
 
 def sweep_grid(config: Config) -> list[dict[str, float]]:

@@ -6,8 +6,7 @@ from mjx_balance.config.sweep import sweep_grid, with_values
 from mjx_balance.files.text import quote
 from mjx_balance.files.validation import check_types
 
-MOST_STEPS = 10_000
-"""Greatest number of physics steps per decision."""
+MOST_STEPS = 10_000  #: greatest number of physics steps per decision
 
 
 def check(config: Config) -> Config:

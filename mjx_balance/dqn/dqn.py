@@ -43,8 +43,7 @@ from mjx_balance.dqn.normalization import RunningStatistics
 from mjx_balance.dqn.replay import ReplayState, Symmetries, Transition
 from mjx_balance.policy.heads import Head
 
-Params: TypeAlias = Any
-"""A network's variables, a flax pytree."""
+Params: TypeAlias = Any  #: a network's variables, a flax pytree
 Means: TypeAlias = dict[str, Mean]
 
 
@@ -58,16 +57,11 @@ class DQNSpec:
     """
 
     config: DQNConfig
-    num_envs: int
-    """Envs over all devices."""
-    num_env_steps: int
-    """Decisions of the run over all envs, for the learning rate's schedule."""
-    devices: Sequence[Any] = dataclasses.field(default_factory=jax.devices)
-    """The mesh."""
-    num_seeds: int = 1
-    """Independent runs in one program."""
-    symmetries: Symmetries | None = None
-    """Reflections of the env, for `config.mirror`."""
+    num_envs: int  #: envs over all devices
+    num_env_steps: int  #: decisions of the run over all envs, for the learning rate's schedule
+    devices: Sequence[Any] = dataclasses.field(default_factory=jax.devices)  #: the mesh
+    num_seeds: int = 1  #: independent runs in one program
+    symmetries: Symmetries | None = None  #: reflections of the env, for `config.mirror`
     action_factors: tuple[int, ...] | None = None
     """Levels of each digit of an action index, for the exploration noise; None: one digit."""
     first_reset: Callable[[jax.Array], State] | None = None
@@ -108,23 +102,16 @@ class TrainState(NamedTuple):
     With several seeds, every leaf has a leading seed axis.
     """
 
-    params: Params
-    """For whitened observations, if `whiten_steps` is positive."""
-    target_params: Params
-    """For raw observations: each copy includes the whitening at its time."""
+    params: Params  #: for whitened observations, if `whiten_steps` is positive
+    target_params: Params  #: for raw observations: each copy includes the whitening at its time
     opt_state: optax.OptState
     statistics: RunningStatistics
-    env_state: State
-    """(num_envs, ...) per leaf, sharded."""
-    replay: ReplayState
-    """Data sharded; position and size count one device's rows."""
-    env_steps: Int[Array, ""]
-    """Decisions over all envs."""
+    env_state: State  #: (num_envs, ...) per leaf, sharded
+    replay: ReplayState  #: data sharded; position and size count one device's rows
+    env_steps: Int[Array, ""]  #: decisions over all envs
     gradient_steps: Int[Array, ""]
-    key: PRNGKeyArray
-    """The same on every device."""
-    sweep: dict[str, Float[Array, ""]]
-    """Value of each swept field of the config."""
+    key: PRNGKeyArray  #: the same on every device
+    sweep: dict[str, Float[Array, ""]]  #: value of each swept field of the config
 
 
 class UpdateState(NamedTuple):

@@ -23,10 +23,8 @@ class RunningStatistics(NamedTuple):
 
     mean: Float[Array, " obs"]
     covariance: Float[Array, "obs obs"]
-    batches: Float[Array, ""]
-    """Number of batches."""
-    matrix: Float[Array, "obs obs"]
-    """(obs - mean) @ matrix is white."""
+    batches: Float[Array, ""]  #: number of batches
+    matrix: Float[Array, "obs obs"]  #: (obs - mean) @ matrix is white
 
 
 def init(obs_size: int, floor: float) -> RunningStatistics:

@@ -24,24 +24,19 @@ class Transition(NamedTuple):
     """One step of one env; in the buffer, every field has a leading capacity axis."""
 
     obs: Float[Array, "*rows obs"]
-    action: Int[Array, "*rows"]
-    """Index, int32."""
+    action: Int[Array, "*rows"]  #: index, int32
     reward: Float[Array, "*rows"]
     terminated: Float[Array, "*rows"]
     """1 after a termination, else 0, also after a truncation: only the former end bootstrapping."""
-    next_obs: Float[Array, "*rows obs"]
-    """The observation before any reset."""
+    next_obs: Float[Array, "*rows obs"]  #: the observation before any reset
 
 
 class ReplayState(NamedTuple):
     """A ring of transitions."""
 
-    data: Transition
-    """(capacity, ...) per field."""
-    position: Int[Array, ""]
-    """Row at which the next batch starts."""
-    size: Int[Array, ""]
-    """Number of rows with transitions."""
+    data: Transition  #: (capacity, ...) per field
+    position: Int[Array, ""]  #: row at which the next batch starts
+    size: Int[Array, ""]  #: number of rows with transitions
 
 
 def init(example: Transition, capacity: int, batch: int) -> ReplayState:

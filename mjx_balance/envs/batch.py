@@ -22,12 +22,9 @@ from mjx_balance.task.tilt import Scenario, draw_scenario
 class Episodes(NamedTuple):
     """What n episodes consist of, besides a robot and its actions; all arrays begin with n."""
 
-    scenario: Scenario
-    """Where the boards go."""
-    params: DomainParams | None = None
-    """None: nominal."""
-    pushes: Pushes | None = None
-    """None: no pushes."""
+    scenario: Scenario  #: where the boards go
+    params: DomainParams | None = None  #: None: nominal
+    pushes: Pushes | None = None  #: None: no pushes
     rngs: Sequence[np.random.Generator] = ()
     """Of each episode, for its sensor noise; needed where `params` has some."""
 

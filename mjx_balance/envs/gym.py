@@ -51,8 +51,7 @@ class _Balance:
     """What one env and many have in common: scene, actions, episodes and pictures."""
 
     metadata: dict[str, Any]
-    threads: int | None = None
-    """Worker threads; None: all cores."""
+    threads: int | None = None  #: worker threads; None: all cores
     # Of the class: an env whose constructor failed is closed, too.
     _painter: Painter | None = None
 

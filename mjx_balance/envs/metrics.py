@@ -9,9 +9,7 @@ class Metric(NamedTuple):
     A metric without a row is logged under its own name, as a mean over decisions.
     """
 
-    name: str | None = None
-    """Logged name; None: its own."""
+    name: str | None = None  #: logged name; None: its own
     per: Literal["decision", "minute", "call"] = "decision"
     """A mean over decisions, a rate per minute of one env, or a sum over a call's decisions."""
-    per_seed: bool = False
-    """Whether it is also logged for every seed, if there are several."""
+    per_seed: bool = False  #: whether it is also logged for every seed, if there are several

@@ -18,10 +18,8 @@ from mjx_balance.task import tilt
 from mjx_balance.task.actions import nearest_action
 from mjx_balance.task.attitude import roll_pitch
 
-HORIZON = 8
-"""Decisions that the predictive controllers look ahead."""
-SWEEPS = 25
-"""Rounds of coordinate descent of the predictive controllers."""
+HORIZON = 8  #: decisions that the predictive controllers look ahead
+SWEEPS = 25  #: rounds of coordinate descent of the predictive controllers
 
 
 class View(NamedTuple):
@@ -48,10 +46,8 @@ class ControllerError(InputError):
 class Response(NamedTuple):
     """What one action does to the body, measured in the simulator once."""
 
-    gain: np.ndarray
-    """(2,) change of roll and pitch per height change a_x, a_y, deg/m, in the end."""
-    course: np.ndarray
-    """(2, HORIZON * sim_steps) share of it reached after each physics step."""
+    gain: np.ndarray  #: (2,) change of roll and pitch per height change a_x, a_y, deg/m, in the end
+    course: np.ndarray  #: (2, HORIZON * sim_steps) share of it reached after each physics step
 
 
 def measure_response(scene: Scene) -> Response:

@@ -16,20 +16,13 @@ from mjx_balance.sim.scene import Scene
 class Envelope:
     """How a controller fares over the greatest incline and the speed of the board."""
 
-    inclines: list[float]
-    """Board angle on both axes at once, deg."""
-    rates: list[float]
-    """Board speed on each axis, deg/s."""
-    fall_rate: list[list[float]]
-    """[incline][rate] share of the scenarios that end in a fall."""
-    mean_tilt: list[list[float]]
-    """[incline][rate] deg, a fall counting as fail_tilt to the end."""
-    authority: float
-    """Speed beyond which the action set cannot follow, deg/s (`limits.authority`)."""
-    reach: float
-    """Incline beyond which the legs are too short, deg (`limits.greatest_incline`)."""
-    scenarios: int
-    """Per cell."""
+    inclines: list[float]  #: board angle on both axes at once, deg
+    rates: list[float]  #: board speed on each axis, deg/s
+    fall_rate: list[list[float]]  #: [incline][rate] share of the scenarios that end in a fall
+    mean_tilt: list[list[float]]  #: [incline][rate] deg, a fall counting as fail_tilt to the end
+    authority: float  #: speed beyond which the action set cannot follow, deg/s (`limits.authority`)
+    reach: float  #: incline beyond which the legs are too short, deg (`limits.greatest_incline`)
+    scenarios: int  #: per cell
     duration_s: float
     seed: int
 

@@ -27,10 +27,8 @@ from mjx_balance.task.step import Outcome
 
 TILT_COPIES = 3
 """Arrays of every scenario's tilt at every step that a summary needs at once, float64."""
-SETTLED_SECONDS = 3.0
-"""End of every target's period in which the board has long been at rest, s."""
-Progress = Callable[[float], None]
-"""Takes the share done."""
+SETTLED_SECONDS = 3.0  #: end of every target's period in which the board has long been at rest, s
+Progress = Callable[[float], None]  #: takes the share done
 
 
 class EvaluationError(InputError):
@@ -47,16 +45,12 @@ class Rollout:
     """What happened, for every scenario and physics step."""
 
     task: TaskConfig
-    tilt: np.ndarray
-    """(scenarios, steps) body tilt, deg; fail_tilt from a fall on."""
-    fell_at: np.ndarray
-    """(scenarios,) step of the fall, or the number of steps."""
+    tilt: np.ndarray  #: (scenarios, steps) body tilt, deg; fail_tilt from a fall on
+    fell_at: np.ndarray  #: (scenarios,) step of the fall, or the number of steps
     action_mm: np.ndarray
     """(scenarios, decisions) mean of the two axes' height changes, mm; NaN after a fall."""
-    qpos: np.ndarray | None
-    """(scenarios, steps, nq), if recorded."""
-    seconds: float
-    """Time spent."""
+    qpos: np.ndarray | None  #: (scenarios, steps, nq), if recorded
+    seconds: float  #: time spent
 
     @property
     def fell(self) -> np.ndarray:

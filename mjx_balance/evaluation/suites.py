@@ -36,10 +36,8 @@ class Suite:
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
     """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg."""
-    fast: bool = False
-    """Board speeds uniform from the config's to the authority limit."""
-    steep: bool = False
-    """Inclines uniform from the config's to the reach of the legs."""
+    fast: bool = False  #: board speeds uniform from the config's to the authority limit
+    steep: bool = False  #: inclines uniform from the config's to the reach of the legs
 
 
 SUITES: dict[str, Suite] = {

@@ -44,17 +44,13 @@ class RunFolder:
         """Policies validated during training, in folders named by env steps."""
         self.seeds_summary = path / "seeds.json"
         """With several seeds: evaluation and validation of each, and the choice among them."""
-        self.seeds = path / "seeds"
-        """With several seeds: the policy and evaluation of each."""
-        self.sweep = path / "sweep.json"
-        """Results of the combinations of a sweep, the best first."""
+        self.seeds = path / "seeds"  #: with several seeds: the policy and evaluation of each
+        self.sweep = path / "sweep.json"  #: results of the combinations of a sweep, the best first
         self.policy = path / "policy.safetensors"
         self.evaluation = path / "evaluation.json"
         self.figures = path / "figures"
-        self.profile = path / "profile"
-        """Trace of one call of the training program, on request."""
-        self.report = path / "report.json"
-        """Cached measurements of the report."""
+        self.profile = path / "profile"  #: trace of one call of the training program, on request
+        self.report = path / "report.json"  #: cached measurements of the report
 
     def validated_policy(self, seed: int, env_steps: int) -> Path:
         return self.validated / str(env_steps) / f"seed-{seed}.safetensors"

@@ -1,7 +1,6 @@
 """Shortens untrusted text to one line of a message."""
 
-MESSAGE = 300
-"""Greatest length of another library's error in a message, characters."""
+MESSAGE = 300  #: greatest length of another library's error in a message, characters
 
 
 def shorten(text: object, limit: int = 80) -> str:

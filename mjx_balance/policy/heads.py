@@ -18,10 +18,8 @@ import numpy as np
 class Additive:
     """The value of an action is the sum of the values of its digits."""
 
-    branches: Any
-    """(..., sum(factors)) a value for every digit of every factor."""
-    factors: tuple[int, ...]
-    """Number of levels of each digit."""
+    branches: Any  #: (..., sum(factors)) a value for every digit of every factor
+    factors: tuple[int, ...]  #: number of levels of each digit
 
     def q_values(self) -> Any:
         """Values of all actions, (..., prod(factors))."""
@@ -57,14 +55,10 @@ class Radial:
     z = sqrt(delta^2 + |exp(stretch) * (x(a) - mu(s))|^2)
     """
 
-    out: Any
-    """(..., 1 + len(factors)) V and mu."""
-    profile: Any
-    """(4,) alpha, beta, kappa and delta, before softplus."""
-    stretch: Any
-    """(len(factors),) logarithm of each axis' scale."""
-    factors: tuple[int, ...]
-    """Number of points on each axis."""
+    out: Any  #: (..., 1 + len(factors)) V and mu
+    profile: Any  #: (4,) alpha, beta, kappa and delta, before softplus
+    stretch: Any  #: (len(factors),) logarithm of each axis' scale
+    factors: tuple[int, ...]  #: number of points on each axis
 
     def q_values(self) -> Any:
         """Values of all actions, (..., prod(factors))."""

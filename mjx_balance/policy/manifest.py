@@ -20,8 +20,7 @@ from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import input_rows
 
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
-CONVERTIBLE = 4
-"""Older version that `upgrade` converts."""
+CONVERTIBLE = 4  #: older version that `upgrade` converts
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts a file of version 4"
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 """Packages whose versions a manifest records."""

@@ -19,8 +19,7 @@ from mjx_balance.policy.manifest import installed_version
 from mjx_balance.policy.network import Policy
 
 OPSET = 17
-IR_VERSION = 8
-"""The version that goes with opset 17; a higher one would exclude older runtimes."""
+IR_VERSION = 8  #: the version that goes with opset 17; a higher one would exclude older runtimes
 ABOUT = (
     "Greedy policy of mjx_balance. The metadata's inputs say what each entry of the observation "
     "is, in order; the action is a row of actions.table_m in the metadata's manifest."

@@ -27,13 +27,10 @@ from mjx_balance.sim.scene import Scene
 DURATION = 60.0
 ENVELOPE_SCENARIOS = 2
 ENVELOPE_DURATION = 30.0
-RECORD_SECONDS = 100.0
-"""As long as the paper's Fig. 7."""
+RECORD_SECONDS = 100.0  #: as long as the paper's Fig. 7
 VIDEO_SECONDS = 12.0
-BINS = 161
-"""Of the tilt distribution."""
-NAMES = ("policy", *CONTROLLERS)
-"""Of all that is measured."""
+BINS = 161  #: of the tilt distribution
+NAMES = ("policy", *CONTROLLERS)  #: of all that is measured
 _Shares = dict[str, dict[str, Annotated[list[Finite], Len(BINS, BINS)]]]
 
 
@@ -45,8 +42,7 @@ class Measurements:
     """Controller -> suite -> fields of `reading.SuiteResult`."""
     shares: dict[str, dict[str, list[float]]]
     """Controller -> suite -> (BINS,) share of the physics steps per bin of tilt (`edges`)."""
-    envelope: Envelope
-    """Of the policy."""
+    envelope: Envelope  #: of the policy
 
 
 def code_digest() -> str:

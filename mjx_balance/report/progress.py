@@ -21,8 +21,7 @@ from rich.table import Table
 
 from mjx_balance.evaluation.suites import HEADLINE
 
-PLAIN_INTERVAL = 5.0
-"""Seconds between two plain lines."""
+PLAIN_INTERVAL = 5.0  #: seconds between two plain lines
 METRICS = {
     "perf/env_steps_per_second": ("decisions/s", "{:,.0f}"),
     "train/tilt_deg": ("mean tilt", "{:.3f} deg"),

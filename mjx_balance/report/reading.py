@@ -20,13 +20,10 @@ from mjx_balance.files.validation import STRICT, parse
 from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report.figures import CURVES, HELD_OUT
 
-METRICS_BYTES = 8 * 2**20
-"""Bytes of metrics.jsonl that are read; the rest is ignored."""
-LINE_BYTES = 2**18
-"""Greatest length of a line of metrics.jsonl."""
+METRICS_BYTES = 8 * 2**20  #: bytes of metrics.jsonl that are read; the rest is ignored
+LINE_BYTES = 2**18  #: greatest length of a line of metrics.jsonl
 MOST_SEEDS = 1000
-GREATEST = 1e15
-"""Bound of every number of a run; doubles represent all integers up to here."""
+GREATEST = 1e15  #: bound of every number of a run; doubles represent all integers up to here
 FOREIGN = (
     *(ValueError, TypeError, KeyError, AttributeError),
     *(OverflowError, RecursionError, MemoryError, OSError),

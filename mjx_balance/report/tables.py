@@ -12,8 +12,7 @@ from rich.table import Table
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder
 
-STATISTICS = ("mean", "p50", "p95", "p99", "max")
-"""Tilt statistics in the table of an evaluation."""
+STATISTICS = ("mean", "p50", "p95", "p99", "max")  #: tilt statistics in the table of an evaluation
 
 
 def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:

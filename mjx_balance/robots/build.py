@@ -19,19 +19,16 @@ from mjx_balance.robots.measure import JOINT_ACTUATORS, check_joints, measure, p
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import Foot, LegFile, RobotError, RobotFile
 
-FRESH = mujoco.MjSpec()
-"""MuJoCo's defaults, which its maker's model may have changed."""
+FRESH = mujoco.MjSpec()  #: MuJoCo's defaults, which its maker's model may have changed
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
-BOARD_SIZE = "board_size"
-"""Name of the model's numeric element with `RobotFile.board_size`."""
+BOARD_SIZE = "board_size"  #: name of the model's numeric element with `RobotFile.board_size`
 REMOVED = (
     *("keys", "sensors", "excludes", "pairs", "equalities", "tuples", "numerics", "texts"),
     *("tendons", "skins", "flexes", "lights", "cameras"),
 )
 """Elements of the maker's model that are removed; what refers to others goes before those."""
-RADIUS_TOLERANCE = 1e-4
-"""Greatest difference between the radii of the feet, m."""
+RADIUS_TOLERANCE = 1e-4  #: greatest difference between the radii of the feet, m
 
 
 def scene_dir() -> Path:
@@ -219,8 +216,7 @@ class _FootPlace(NamedTuple):
     """Where the model has a foot."""
 
     body: mujoco.MjsBody
-    element: mujoco.MjsGeom | mujoco.MjsSite | None = None
-    """The geom or site that the file names."""
+    element: mujoco.MjsGeom | mujoco.MjsSite | None = None  #: the geom or site that the file names
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """In the body's frame, m, without an element."""
 

@@ -18,8 +18,7 @@ HEADER = """\
 # Drafted from the model's structure; a corner's letters say front or rear, left or right.
 # `mjx-balance robot check FILE` builds it, says what it found, and draws a picture.
 """
-USUAL_RADIUS = 0.02
-"""Radius of a foot that is no sphere, m."""
+USUAL_RADIUS = 0.02  #: radius of a foot that is no sphere, m
 MIN_REACH = 0.85
 """Least distance of a foot from the knee, as a share of the calf's length; a sphere or site that
 is nearer is no foot."""
@@ -30,14 +29,10 @@ class _Leg(NamedTuple):
     """Three hinges on three nested bodies, with no other joint on them, and a foot."""
 
     joints: list[int]
-    foot: str
-    """Value of `foot` in the file, TOML."""
-    place: np.ndarray
-    """Of the foot in the world, (3,) m."""
-    radius: float
-    """Of the foot, m."""
-    sphere: bool = False
-    """Whether `foot` names a sphere geom, which gives the radius."""
+    foot: str  #: value of `foot` in the file, TOML
+    place: np.ndarray  #: of the foot in the world, (3,) m
+    radius: float  #: of the foot, m
+    sphere: bool = False  #: whether `foot` names a sphere geom, which gives the radius
 
 
 def draft(model: str, path: Path) -> str:

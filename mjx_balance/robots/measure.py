@@ -14,15 +14,13 @@ from mjx_balance.robots.schema import LegFile, RobotError, RobotFile
 
 LEVEL = math.cos(math.radians(1.0))
 """Cosine of the greatest angle between a joint's axis and the trunk's axis."""
-SLACK = 1e-3
-"""Tolerance of an abduction's limits, rad."""
+SLACK = 1e-3  #: tolerance of an abduction's limits, rad
 FREE_KNEE = (0.1, 2.7)
 """Least and greatest bend of a knee without limits, rad: almost straight, almost on the thigh."""
 WHOLE_TURNS = [2 * math.pi * k for k in (0, 1, -1, 2, -2)]
 """Offsets of a model's joint angles from ours, rad."""
 JOINT_ACTUATORS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-UNLIMITED = 1e4
-"""Torque limit of servos if neither file nor model gives one, N m."""
+UNLIMITED = 1e4  #: torque limit of servos if neither file nor model gives one, N m
 
 # Numbers of our own robot (robots/quadruped.toml), from which others are scaled.
 OUR_LEG, OUR_HALF_TRACK, OUR_HEIGHT = 0.426, 0.142, 0.35
@@ -30,13 +28,10 @@ OUR_STIFFNESS, OUR_DAMPING, OUR_ARMATURE = 400.0, 16.0, 0.02
 OUR_ACTION = 0.003  # paper Eq. 3
 STRETCH = 0.77
 """Standing length of the legs as a share of their full length: 0.35 m for ours (paper 3.1)."""
-SMALLEST = 0.01
-"""Least mass and size relative to ours."""
-INCLINE = 7.0
-"""Board angle on both axes at once that the legs must compensate, deg (paper 3.1)."""
+SMALLEST = 0.01  #: least mass and size relative to ours
+INCLINE = 7.0  #: board angle on both axes at once that the legs must compensate, deg (paper 3.1)
 
-Range = tuple[float, float]
-"""Least and greatest turn of a link (`Leg`), rad."""
+Range = tuple[float, float]  #: least and greatest turn of a link (`Leg`), rad
 
 
 def measure(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: float) -> Robot:

@@ -9,11 +9,9 @@ from annotated_types import Ge, Le, Len
 
 from mjx_balance.files.validation import STRICT
 
-MOST = 1e7
-"""Bound of a robot's numbers, in their units."""
+MOST = 1e7  #: bound of a robot's numbers, in their units
 Number = Annotated[float, Ge(-MOST), Le(MOST)]
-OUR_MASS, OUR_LEVER = 15.2, 0.193
-"""Mass and lever of our own robot, kg and m."""
+OUR_MASS, OUR_LEVER = 15.2, 0.193  #: mass and lever of our own robot, kg and m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,28 +28,17 @@ class Leg:
     name: str
     left: bool
     front: bool
-    joints: tuple[str, str, str]
-    """Abduction, hip and knee; the scene's servos have the same names."""
-    foot: str
-    """Name of the foot's sphere geom in the scene."""
-    x: Number
-    """x of the hip, and of the foot under it, m."""
-    y: Number
-    """y of the foot, m."""
-    axis_height: Number
-    """z of the abduction's axis, m."""
-    drop: Number
-    """Distance from the abduction's axis down to the hip, m."""
-    offset: Number
-    """Distance from the abduction's axis to the left, to the plane of the foot, m."""
-    thigh: Number
-    """Length from hip to knee, m."""
-    calf: Number
-    """Length from knee to the foot's centre, m."""
-    signs: tuple[Number, Number, Number]
-    """+-1, of abduction, hip and knee."""
-    zeros: tuple[Number, Number, Number]
-    """Turns at joint angle 0, rad."""
+    joints: tuple[str, str, str]  #: abduction, hip and knee; the scene's servos have the same names
+    foot: str  #: name of the foot's sphere geom in the scene
+    x: Number  #: x of the hip, and of the foot under it, m
+    y: Number  #: y of the foot, m
+    axis_height: Number  #: z of the abduction's axis, m
+    drop: Number  #: distance from the abduction's axis down to the hip, m
+    offset: Number  #: distance from the abduction's axis to the left, to the plane of the foot, m
+    thigh: Number  #: length from hip to knee, m
+    calf: Number  #: length from knee to the foot's centre, m
+    signs: tuple[Number, Number, Number]  #: +-1, of abduction, hip and knee
+    zeros: tuple[Number, Number, Number]  #: turns at joint angle 0, rad
     knee: tuple[Number, Number]
     """Least and greatest turn of the calf against the thigh, rad; negative: the knee points
     backward."""
@@ -68,12 +55,9 @@ class Body:
 
     __pydantic_config__ = STRICT
 
-    name: str
-    """The stem of the robot's file name."""
-    legs: Annotated[tuple[Leg, ...], Len(4, 4)]
-    """In the order of the observation."""
-    trunk: str
-    """Name of the body to keep level; it has a free joint."""
+    name: str  #: the stem of the robot's file name
+    legs: Annotated[tuple[Leg, ...], Len(4, 4)]  #: in the order of the observation
+    trunk: str  #: name of the body to keep level; it has a free joint
     foot_radius: Number
     trunk_mass: Number
     total_mass: Number
@@ -129,19 +113,12 @@ class Body:
 class Robot(Body):
     """Body, servos, friction and the numbers that scale with size (`measure.measure`)."""
 
-    hip_torque: Number
-    """Limit of the abduction and hip servos, N m."""
-    knee_torque: Number
-    """Limit of the knee servos, N m."""
-    servo_stiffness: Number
-    """Position gain of the leg servos, N m / rad."""
-    servo_damping: Number
-    """Damping of the leg joints, N m s / rad."""
-    servo_armature: Number
-    """Inertia of rotor and gear at the joint, kg m^2."""
-    foot_friction: Number
-    """Sliding friction of a foot on the board."""
+    hip_torque: Number  #: limit of the abduction and hip servos, N m
+    knee_torque: Number  #: limit of the knee servos, N m
+    servo_stiffness: Number  #: position gain of the leg servos, N m / rad
+    servo_damping: Number  #: damping of the leg joints, N m s / rad
+    servo_armature: Number  #: inertia of rotor and gear at the joint, kg m^2
+    foot_friction: Number  #: sliding friction of a foot on the board
     body_height: Number
     """Standing height of the trunk's origin above the board, foot radius included, m."""
-    action_max: Number
-    """Greatest height change of one decision on one axis, m."""
+    action_max: Number  #: greatest height change of one decision on one axis, m

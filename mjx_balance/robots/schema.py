@@ -14,8 +14,7 @@ from mjx_balance.robots.robot import MOST, Number
 
 Name = Annotated[str, MinLen(1)]
 Positive = Annotated[float, Gt(0), Le(MOST)]
-Place = tuple[Number, Number, Number]
-"""x, y and z, m."""
+Place = tuple[Number, Number, Number]  #: x, y and z, m
 
 
 class RobotError(ConfigError):
@@ -29,8 +28,7 @@ class Foot:
     __pydantic_config__ = STRICT
 
     body: Name
-    offset: Place
-    """In the body's frame, m."""
+    offset: Place  #: in the body's frame, m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,14 +38,10 @@ class LegFile:
     __pydantic_config__ = STRICT
 
     name: Name
-    joints: tuple[Name, Name, Name]
-    """Abduction, hip and knee."""
-    foot: Name | Foot
-    """Name of a geom, site or body, or a place on a body."""
-    side: Literal["left", "right"] | None = None
-    """None: from its place."""
-    end: Literal["front", "hind"] | None = None
-    """None: from its place."""
+    joints: tuple[Name, Name, Name]  #: abduction, hip and knee
+    foot: Name | Foot  #: name of a geom, site or body, or a place on a body
+    side: Literal["left", "right"] | None = None  #: None: from its place
+    end: Literal["front", "hind"] | None = None  #: None: from its place
     knee: Literal["forward", "backward"] | None = None
     """Direction in which the knee points; none: from its limits."""
 
@@ -58,44 +52,31 @@ class RobotFile:
 
     __pydantic_config__ = STRICT
 
-    name: str
-    """Stem of the file name."""
-    folder: Path
-    """Folder of the file."""
+    name: str  #: stem of the file name
+    folder: Path  #: folder of the file
     model: Name
     """MJCF or URDF file, relative to `folder`; or `PACKAGE:PATH` of a file inside an installed
     Python package; or `menagerie:NAME`."""
-    trunk: Name
-    """Name of the body to keep level."""
-    legs: Annotated[tuple[LegFile, ...], Len(4, 4)]
-    """In the order of the observation."""
+    trunk: Name  #: name of the body to keep level
+    legs: Annotated[tuple[LegFile, ...], Len(4, 4)]  #: in the order of the observation
     imu: Name | Place | None = None
     """Site on the trunk, or a place in its frame, m; none: the trunk's origin."""
-    strip: tuple[Name, ...] = ()
-    """Bodies to remove, with their descendants, and joints to fix."""
-    foot_radius: Positive | None = None
-    """m; none: from the sphere geoms of the feet."""
-    foot_friction: Positive = 0.8
-    """Sliding friction of a foot on the board."""
+    strip: tuple[Name, ...] = ()  #: bodies to remove, with their descendants, and joints to fix
+    foot_radius: Positive | None = None  #: m; none: from the sphere geoms of the feet
+    foot_friction: Positive = 0.8  #: sliding friction of a foot on the board
     hip_torque: Positive | None = None
     """Torque limit of the abduction and hip servos, N m; none: from the model's actuators."""
     knee_torque: Positive | None = None
     """Torque limit of the knee servos, N m; none: from the model's actuators."""
     servo_stiffness: Positive | None = None
     """N m / rad; none, also of the next five: from the robot's mass and size."""
-    servo_damping: Positive | None = None
-    """N m s / rad."""
-    servo_armature: Positive | None = None
-    """Inertia of rotor and gear at the joint, kg m^2."""
-    body_height: Positive | None = None
-    """Standing height of the trunk's origin above the board, m."""
-    action_max: Positive | None = None
-    """Greatest height change of one decision on one axis, m."""
-    board_size: Positive | None = None
-    """Length of the board in training, m."""
+    servo_damping: Positive | None = None  #: N m s / rad
+    servo_armature: Positive | None = None  #: inertia of rotor and gear at the joint, kg m^2
+    body_height: Positive | None = None  #: standing height of the trunk's origin above the board, m
+    action_max: Positive | None = None  #: greatest height change of one decision on one axis, m
+    board_size: Positive | None = None  #: length of the board in training, m
     source: str = ""
-    license: str = ""
-    """Of the model, like `source`."""
+    license: str = ""  #: of the model, like `source`
 
 
 REMEDIES = {

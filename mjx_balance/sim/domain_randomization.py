@@ -11,8 +11,7 @@ from mjx_balance.sim.scene import Scene
 from mjx_balance.task import Array
 from mjx_balance.task.randomization import DomainParams
 
-MODEL_PARAMS = ("payload", "payload_at", "friction", "gain")
-"""Parameters that change the model."""
+MODEL_PARAMS = ("payload", "payload_at", "friction", "gain")  #: parameters that change the model
 
 
 def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
@@ -62,14 +61,11 @@ def _principal(model: mujoco.MjModel, body: int) -> Float[np.ndarray, "3 3"]:
 class _AtRest(NamedTuple):
     """Jacobians and inertia of the nominal model at qpos0."""
 
-    inertia: Float[np.ndarray, "nv nv"]
-    """Without the trunk's part."""
+    inertia: Float[np.ndarray, "nv nv"]  #: without the trunk's part
     centres: Float[np.ndarray, "nbody 3 nv"]
     """Of the bodies' centres of mass; the trunk's: of its frame's origin."""
-    turns: Float[np.ndarray, "nbody 3 nv"]
-    """Rotational."""
-    trunk_turns: Float[np.ndarray, "3 nv"]
-    """The trunk's, about its principal axes."""
+    turns: Float[np.ndarray, "nbody 3 nv"]  #: rotational
+    trunk_turns: Float[np.ndarray, "3 nv"]  #: the trunk's, about its principal axes
 
 
 @functools.lru_cache(maxsize=8)

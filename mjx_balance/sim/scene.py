@@ -32,8 +32,7 @@ class Stance:
     leg_trim: Float[np.ndarray, "legs 3"]
     """Added to the joint angles so that the servos reach them under load, rad: the robot's own
     weight would otherwise bend the legs by millimetres."""
-    imu: Float[np.ndarray, "6"]
-    """Gyro in rad/s and accelerometer in m/s^2 at rest."""
+    imu: Float[np.ndarray, "6"]  #: gyro in rad/s and accelerometer in m/s^2 at rest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,25 +41,17 @@ class Layout:
 
     task: TaskConfig
     robot: Robot
-    robot_source: str
-    """As `Config.robot`."""
+    robot_source: str  #: as `Config.robot`
     model: mujoco.MjModel
-    trunk: int
-    """Id of the trunk's body."""
-    leg_qpos: Int[np.ndarray, "legs 3"]
-    """Of the leg joints in qpos."""
-    leg_ctrl: Int[np.ndarray, "legs 3"]
-    """Of the leg servos in ctrl."""
-    board_qpos: Int[np.ndarray, "2"]
-    """Of the board hinges, X and Y, in qpos."""
-    board_ctrl: Int[np.ndarray, "2"]
-    """Of the board servos in ctrl."""
-    trunk_quat: Int[np.ndarray, "4"]
-    """Of the trunk's orientation in qpos."""
+    trunk: int  #: id of the trunk's body
+    leg_qpos: Int[np.ndarray, "legs 3"]  #: of the leg joints in qpos
+    leg_ctrl: Int[np.ndarray, "legs 3"]  #: of the leg servos in ctrl
+    board_qpos: Int[np.ndarray, "2"]  #: of the board hinges, X and Y, in qpos
+    board_ctrl: Int[np.ndarray, "2"]  #: of the board servos in ctrl
+    trunk_quat: Int[np.ndarray, "4"]  #: of the trunk's orientation in qpos
     trunk_velocity: Int[np.ndarray, "2"]
     """Of the trunk's velocity along the world's x and y in qvel."""
-    imu: Int[np.ndarray, "6"]
-    """Of gyro and accelerometer in sensordata."""
+    imu: Int[np.ndarray, "6"]  #: of gyro and accelerometer in sensordata
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,5 +7,4 @@ None of them knows an engine. Annotations give shapes; `*batch` and `...` are an
 
 from typing import Any, TypeAlias
 
-Array: TypeAlias = Any
-"""A NumPy or JAX array, as in `Float[Array, "*batch legs"]`."""
+Array: TypeAlias = Any  #: a NumPy or JAX array, as in `Float[Array, "*batch legs"]`

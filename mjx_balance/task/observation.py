@@ -27,28 +27,21 @@ class Mirror(NamedTuple):
 class Row(NamedTuple):
     """One input of the network: the mean of `window` samples, each less `offset`, over `scale`."""
 
-    name: str
-    """Unique, e.g. `H_LF`, `C_LF,d-1`, `V_x,t-2`, `Acc_y,t-15`."""
-    sensor: str
-    """One of `SENSORS`."""
+    name: str  #: unique, e.g. `H_LF`, `C_LF,d-1`, `V_x,t-2`, `Acc_y,t-15`
+    sensor: str  #: one of `SENSORS`
     index: int  # pyright: ignore[reportIncompatibleMethodOverride]
     """Leg in the robot's order, or axis: 0, 1, 2 for x, y, z."""
-    lag: int
-    """Age of the newest sample averaged, in samples of the sensor; 0 is the latest."""
-    window: int
-    """Samples averaged, from there back."""
-    offset: float
-    """In the sensor's unit."""
-    scale: float
-    """Size that enters the network as 1, in the sensor's unit; a float32."""
+    lag: int  #: age of the newest sample averaged, in samples of the sensor; 0 is the latest
+    window: int  #: samples averaged, from there back
+    offset: float  #: in the sensor's unit
+    scale: float  #: size that enters the network as 1, in the sensor's unit; a float32
     mirror: Mirror
 
 
 class Signals(NamedTuple):
     """Samples of all sensors up to a decision, the newest last."""
 
-    heights: Float[Array, "*batch 1 legs"]
-    """Measured foot heights, m."""
+    heights: Float[Array, "*batch 1 legs"]  #: measured foot heights, m
     commands: Float[Array, "*batch decisions legs"]
     """Commanded foot heights, a sample per decision, m."""
     imu: Float[Array, "*batch samples 6"]
@@ -58,10 +51,8 @@ class Signals(NamedTuple):
 class Sensor(NamedTuple):
     """Where samples of a sensor are."""
 
-    signal: str
-    """A field of `Signals`."""
-    channel: int
-    """Its entry there that has index 0."""
+    signal: str  #: a field of `Signals`
+    channel: int  #: its entry there that has index 0
 
 
 SENSORS = {
@@ -153,8 +144,7 @@ class _Run(NamedTuple):
 
     signal: str
     offset: float
-    ages: Int[np.ndarray, "window rows"]
-    """Of the samples averaged."""
+    ages: Int[np.ndarray, "window rows"]  #: of the samples averaged
     channels: Int[np.ndarray, " rows"]
 
 

@@ -17,8 +17,7 @@ class Pushes(NamedTuple):
 
     velocity: Float[Array, "*batch pushes 2"]
     """What each adds to the trunk's velocity along the world's x and y, m/s."""
-    due: Int[Array, "*batch pushes"]
-    """Number of the decision that begins with it."""
+    due: Int[Array, "*batch pushes"]  #: number of the decision that begins with it
 
 
 def push_decisions(

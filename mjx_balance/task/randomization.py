@@ -9,25 +9,18 @@ from mjx_balance.config import RandomizationConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
-DRAWS = 6
-"""Uniform random numbers that the parameters of one env take."""
+DRAWS = 6  #: uniform random numbers that the parameters of one env take
 
 
 class DomainParams(NamedTuple):
     """What differs from env to env, of one env or of a batch of them."""
 
-    imu_noise: Float[Array, "*batch 6"]
-    """Standard deviation of every IMU sample, rad/s and m/s^2."""
-    payload: Float[Array, "*batch"]
-    """Mass carried on the trunk, kg."""
-    payload_at: Float[Array, "*batch 3"]
-    """Where, in the trunk's frame, m."""
-    friction: Float[Array, "*batch"]
-    """Sliding friction of the feet."""
-    gain: Float[Array, "*batch"]
-    """Factor on the leg servos' position gain."""
-    delay: Float[Array, "*batch"]
-    """Decisions between choosing an action and taking it, 0 or 1."""
+    imu_noise: Float[Array, "*batch 6"]  #: standard deviation of every IMU sample, rad/s and m/s^2
+    payload: Float[Array, "*batch"]  #: mass carried on the trunk, kg
+    payload_at: Float[Array, "*batch 3"]  #: where, in the trunk's frame, m
+    friction: Float[Array, "*batch"]  #: sliding friction of the feet
+    gain: Float[Array, "*batch"]  #: factor on the leg servos' position gain
+    delay: Float[Array, "*batch"]  #: decisions between choosing an action and taking it, 0 or 1
 
 
 def draw_params(

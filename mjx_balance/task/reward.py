@@ -12,19 +12,15 @@ from mjx_balance.task import Array
 class RewardInputs(NamedTuple):
     """What the reward looks at of one decision."""
 
-    tilt_before: Float[Array, "*batch"]
-    """Body tilt when the decision was taken, deg."""
-    tilt_after: Float[Array, "*batch"]
-    """Body tilt at its end, deg."""
-    fell: Float[Array, "*batch"]
-    """1 where the body failed on the way, else 0."""
+    tilt_before: Float[Array, "*batch"]  #: body tilt when the decision was taken, deg
+    tilt_after: Float[Array, "*batch"]  #: body tilt at its end, deg
+    fell: Float[Array, "*batch"]  #: 1 where the body failed on the way, else 0
 
 
 class RewardRow(NamedTuple):
     """One term of the reward: `weight * function(task, inputs)`."""
 
-    name: str
-    """Its metric is `reward_NAME`."""
+    name: str  #: its metric is `reward_NAME`
     function: Callable[[TaskConfig, RewardInputs], Array]
     weight: float
 

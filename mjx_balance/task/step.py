@@ -20,31 +20,25 @@ from mjx_balance.task.pushes import Pushes, push_velocity
 from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.reward import RewardInputs, failed, reward_terms
 
-DIVERGED = 1e4
-"""Magnitude, in rad, rad/s, m/s^2 or deg, from which a value counts as diverged."""
+DIVERGED = 1e4  #: magnitude, in rad, rad/s, m/s^2 or deg, from which a value counts as diverged
 
 
 class Memory(NamedTuple):
     """What one decision leaves to the next, besides the state of the physics."""
 
-    heights: Float[Array, "*batch legs"]
-    """Foot heights that the legs moved to last, m."""
+    heights: Float[Array, "*batch legs"]  #: foot heights that the legs moved to last, m
     commanded: Float[Array, "*batch decisions legs"]
     """Foot heights that the latest actions commanded, the newest last, m; delayed actions stand
     here before the legs move."""
-    imu: Float[Array, "*batch samples 6"]
-    """Latest IMU samples, the newest last, rad/s and m/s^2."""
-    tilt: Float[Array, "*batch"]
-    """Body tilt of the last reward, deg."""
+    imu: Float[Array, "*batch samples 6"]  #: latest IMU samples, the newest last, rad/s and m/s^2
+    tilt: Float[Array, "*batch"]  #: body tilt of the last reward, deg
 
 
 class Targets(NamedTuple):
     """Servo targets at every physics step of a decision."""
 
-    board: Float[Array, "*batch sim_steps 2"]
-    """Board angles about X and Y, rad."""
-    joints: Float[Array, "*batch sim_steps legs 3"]
-    """Abduction, hip and knee angles, rad."""
+    board: Float[Array, "*batch sim_steps 2"]  #: board angles about X and Y, rad
+    joints: Float[Array, "*batch sim_steps legs 3"]  #: abduction, hip and knee angles, rad
 
 
 class Motion(NamedTuple):
@@ -52,10 +46,8 @@ class Motion(NamedTuple):
 
     imu: Float[Array, "*batch sim_steps 6"]
     """Gyro in rad/s and accelerometer in m/s^2, before each step."""
-    tilt: Float[Array, "*batch sim_steps"]
-    """Body tilt after each step, deg."""
-    joint_angles: Float[Array, "*batch sim_steps legs 3"]
-    """After each step, rad."""
+    tilt: Float[Array, "*batch sim_steps"]  #: body tilt after each step, deg
+    joint_angles: Float[Array, "*batch sim_steps legs 3"]  #: after each step, rad
 
 
 @runtime_checkable
@@ -76,33 +68,24 @@ class Engine(Protocol):
 class EnvState(NamedTuple):
     """State of one env, or of a batch of them."""
 
-    physics: Any
-    """The engine's own."""
+    physics: Any  #: the engine's own
     memory: Memory
-    scenario: tilt.Scenario
-    """Where the board goes."""
-    env_steps: Int[Array, "*batch"]
-    """Decisions since the episode's start."""
-    params: DomainParams | None
-    """None: the nominal model, no sensor noise, no action delay."""
+    scenario: tilt.Scenario  #: where the board goes
+    env_steps: Int[Array, "*batch"]  #: decisions since the episode's start
+    params: DomainParams | None  #: None: the nominal model, no sensor noise, no action delay
     pushes: Pushes | None
 
 
 class Outcome(NamedTuple):
     """What came of a decision."""
 
-    obs: Float[Array, "*batch obs_size"]
-    """The network's next input."""
-    rewards: dict[str, Float[Array, "*batch"]]
-    """By name (`reward_terms`); their sum is the reward."""
-    imu: Float[Array, "*batch sim_steps 6"]
-    """IMU samples with noise, rad/s and m/s^2."""
-    tilt: Float[Array, "*batch sim_steps"]
-    """Body tilt after each step, deg."""
+    obs: Float[Array, "*batch obs_size"]  #: the network's next input
+    rewards: dict[str, Float[Array, "*batch"]]  #: by name (`reward_terms`); their sum is the reward
+    imu: Float[Array, "*batch sim_steps 6"]  #: IMU samples with noise, rad/s and m/s^2
+    tilt: Float[Array, "*batch sim_steps"]  #: body tilt after each step, deg
     terminated: Bool[Array, "*batch"]
     """Whether the body tilted past `fail_tilt`, or the simulation diverged."""
-    diverged: Bool[Array, "*batch"]
-    """Whether the simulation gave values that no robot can reach."""
+    diverged: Bool[Array, "*batch"]  #: whether the simulation gave values that no robot can reach
 
     @property
     def reward(self) -> Float[Array, "*batch"]:

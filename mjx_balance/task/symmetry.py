@@ -15,10 +15,8 @@ class Symmetries(NamedTuple):
 
     obs_index: Int32[np.ndarray, "reflections obs_size"]
     """Entry of the observation that takes each place."""
-    obs_sign: Float32[np.ndarray, "reflections obs_size"]
-    """Its sign there."""
-    action_index: Int32[np.ndarray, "reflections actions"]
-    """Index that each action becomes."""
+    obs_sign: Float32[np.ndarray, "reflections obs_size"]  #: its sign there
+    action_index: Int32[np.ndarray, "reflections actions"]  #: index that each action becomes
 
 
 def symmetries(task: TaskConfig, robot: Robot) -> Symmetries:

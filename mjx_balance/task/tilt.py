@@ -17,12 +17,9 @@ class Scenario(NamedTuple):
     `k * target_period - phase` and stays there once it has arrived.
     """
 
-    targets: Float[Array, "*batch targets 2"]
-    """Board angles about X and Y, deg."""
-    phase: Float[Array, "*batch"]
-    """Time the first target is already old at time 0, s."""
-    rate: Float[Array, "*batch"]
-    """Speed of the board on each axis, deg/s."""
+    targets: Float[Array, "*batch targets 2"]  #: board angles about X and Y, deg
+    phase: Float[Array, "*batch"]  #: time the first target is already old at time 0, s
+    rate: Float[Array, "*batch"]  #: speed of the board on each axis, deg/s
 
 
 def num_targets(task: TaskConfig, duration: float) -> int:

@@ -19,8 +19,7 @@ from mjx_balance.training.processes import ALONE, Processes
 
 T = TypeVar("T")
 
-NEWEST = 2
-"""Checkpoints that stay: one, and one to fall back on."""
+NEWEST = 2  #: checkpoints that stay: one, and one to fall back on
 
 
 class CheckpointError(InputError):

@@ -19,8 +19,7 @@ from mjx_balance.report import tables
 from mjx_balance.training.loop import Run
 from mjx_balance.training.validation import Results, best_validated, exports, scalars, score
 
-CHOICE_SCENARIOS = 32
-"""Scenarios per suite by which one of several seeds is chosen."""
+CHOICE_SCENARIOS = 32  #: scenarios per suite by which one of several seeds is chosen
 FINAL = "final"
 """TensorBoard's name for the evaluation after training, which has the validations' tags."""
 

@@ -33,8 +33,7 @@ LEARNER_METRICS = {
     "diverged": Metric(per="call"),
 }
 """The learner's own metrics; an env's table is added to them."""
-ANSWER_S = 0.2
-"""Longest time that the user waits for an answer to an interrupt, s."""
+ANSWER_S = 0.2  #: longest time that the user waits for an answer to an interrupt, s
 STOPPING = (
     "stopping after this call and saving; interrupt again to quit at once, without what was "
     "learnt since the last checkpoint"
@@ -50,8 +49,7 @@ Validate = Callable[[TrainState], Mapping[str, np.ndarray]]
 class Run:
     """A run: what learns, where it is shown and saved."""
 
-    config: Config
-    """Sized to the devices."""
+    config: Config  #: sized to the devices
     env: BalanceEnv
     learner: DQN
     folder: RunFolder

@@ -139,8 +139,7 @@ class Watch:
 
     def __init__(self, connections: Mapping[int, socket.socket]):
         """Listens to the connections of a meeting, each in a thread, until `end`."""
-        self.advice = ""
-        """What the sentence ends with."""
+        self.advice = ""  #: what the sentence ends with
         self._connections, self._ended = connections, threading.Lock()
         for other, connection in connections.items():
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)

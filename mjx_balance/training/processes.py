@@ -33,12 +33,10 @@ class Interrupted(Exception):
 class Cluster(NamedTuple):
     """A process among all of its run, in the words of `jax.distributed.initialize`."""
 
-    coordinator_address: str
-    """HOST:PORT or [IPv6]:PORT at which process 0 listens."""
+    coordinator_address: str  #: HOST:PORT or [IPv6]:PORT at which process 0 listens
     num_processes: int
     process_id: int
-    local_device_ids: Sequence[int] | None = None
-    """Ids of this process's GPUs; all if None."""
+    local_device_ids: Sequence[int] | None = None  #: ids of this process's GPUs; all if None
 
 
 def find_cluster(address: str | None, process_id: int | None, count: int | None) -> Cluster:
@@ -85,13 +83,10 @@ def resolve(address: str) -> tuple[str, int]:
 class Processes:
     """All processes of a run, as one of them sees them; all of them call the same methods."""
 
-    index: int = 0
-    """Of this process."""
+    index: int = 0  #: of this process
     count: int = 1
-    watch: Watch | None = None
-    """Notices those that die."""
-    cores: int | None = None
-    """CPU cores that every process has; None: all of this one."""
+    watch: Watch | None = None  #: notices those that die
+    cores: int | None = None  #: CPU cores that every process has; None: all of this one
 
     @property
     def first(self) -> bool:
@@ -162,8 +157,7 @@ class Processes:
                 jax.distributed.shutdown()
 
 
-ALONE = Processes()
-"""A run of one process."""
+ALONE = Processes()  #: a run of one process
 
 
 @contextlib.contextmanager

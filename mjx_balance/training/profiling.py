@@ -28,10 +28,8 @@ MEANING = {
 }
 SCOPES = ("physics", "env", "acting", "replay", "updates")
 """`jax.named_scope`s of env and learner; the innermost of them counts."""
-EXCHANGES = ("psum", "pmin", "pmax", "all_gather")
-"""What devices wait for each other in."""
-SKIPPED = 3
-"""Calls before the one that is traced: until then there are no updates yet."""
+EXCHANGES = ("psum", "pmin", "pmax", "all_gather")  #: what devices wait for each other in
+SKIPPED = 3  #: calls before the one that is traced: until then there are no updates yet
 TOO_SHORT = (
     f"--profile traces call {SKIPPED + 1} of the training program, and the run ended before it; "
     "raise num_env_steps, or lower log_every"
@@ -43,8 +41,7 @@ class Event(NamedTuple):
 
     op: str
     start: float
-    duration: float
-    """ns"""
+    duration: float  #: ns
 
     @property
     def end(self) -> float:
@@ -57,8 +54,7 @@ class Profiled:
 
     program: CompiledProgram
     """Compiled without a cache, which would not keep the names of its parts."""
-    folder: Path
-    """For the trace and its `shares.json`."""
+    folder: Path  #: for the trace and its `shares.json`
     log_fn: Callable[[str], None]
     calls: int = 0
 

@@ -43,8 +43,7 @@ FLAGS = (
 """Settings of JAX that change what a trace gives."""
 XLA_DAMAGED = "Error reading persistent compilation cache entry for '"
 
-LogFn: TypeAlias = Callable[[str], None]
-"""Takes one line for the user."""
+LogFn: TypeAlias = Callable[[str], None]  #: takes one line for the user
 
 
 def cache_dir() -> Path:
@@ -123,10 +122,8 @@ def compiler_options() -> dict[str, str | bool]:
 class CompiledProgram:
     """A program state -> (state, output) that is never traced again."""
 
-    compiled: jax.stages.Compiled
-    """Takes and returns the state's leaves."""
-    structure: Any
-    """Of the state's tree."""
+    compiled: jax.stages.Compiled  #: takes and returns the state's leaves
+    structure: Any  #: of the state's tree
 
     def __call__(self, state: Any) -> tuple[Any, Any]:
         leaves, output = self.compiled(jax.tree.leaves(state))

@@ -22,8 +22,7 @@ from mjx_balance.policy.manifest import PolicyError, make_manifest
 from mjx_balance.policy.network import Policy
 from mjx_balance.training.loop import Run, number
 
-Results = dict[str, dict[str, Any]]
-"""Suite name -> JSON of `rollout.summarize`."""
+Results = dict[str, dict[str, Any]]  #: suite name -> JSON of `rollout.summarize`
 
 
 def score(results: Results) -> tuple[int, float]:

@@ -16,10 +16,8 @@ import numpy as np
 
 METADATA = 1
 """`XLA_FFI_Extension_Metadata`: the call asks for the version that the handler was made for."""
-INTERNAL = 13
-"""`XLA_FFI_Error_Code_INTERNAL`."""
-FLOAT32 = 11
-"""`XLA_FFI_DataType_F32`."""
+INTERNAL = 13  #: `XLA_FFI_Error_Code_INTERNAL`
+FLOAT32 = 11  #: `XLA_FFI_DataType_F32`
 
 
 def _struct(name: str, **fields: Any) -> Any:

@@ -14,8 +14,7 @@ from mjx_balance.sim.scene import Scene
 from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.step import Motion, Targets
 
-Ids = Int[np.ndarray, " n"]
-"""Envs of a batch."""
+Ids = Int[np.ndarray, " n"]  #: envs of a batch
 
 
 class MujocoEngine:

@@ -18,31 +18,24 @@ if TYPE_CHECKING:
 class Options(NamedTuple):
     """What an engine is made with, besides the scene."""
 
-    solver_iterations: int
-    """Of MJX's constraint solver; MuJoCo's C engine stops by itself."""
+    solver_iterations: int  #: of MJX's constraint solver; MuJoCo's C engine stops by itself
     line_search_iterations: int
-    num_devices: int | None
-    """JAX devices that the envs are spread over; None: all."""
+    num_devices: int | None  #: JAX devices that the envs are spread over; None: all
 
 
 class EngineRow(NamedTuple):
     """One engine, and what the rest of the package needs to know of it."""
 
-    name: str
-    """As in `Config.engine`."""
+    name: str  #: as in `Config.engine`
     make: str
     """`MODULE:FUNCTION` of this folder, (scene, options) -> `JaxEngine`; imported when called."""
-    platforms: tuple[str, ...] = ()
-    """JAX platforms that it runs on; none named: all."""
-    hardware: str = "every device"
-    """The same in words."""
-    cacheable: bool = True
-    """Whether its traced programs work in another process."""
+    platforms: tuple[str, ...] = ()  #: JAX platforms that it runs on; none named: all
+    hardware: str = "every device"  #: the same in words
+    cacheable: bool = True  #: whether its traced programs work in another process
     module: str | None = None
     """What the extra called as the engine brings, hidden from imports while another engine runs;
     none: the extra `train` is enough."""
-    distribution: str | None = None
-    """The registry's name of that module."""
+    distribution: str | None = None  #: the registry's name of that module
 
 
 ENGINES = {
