@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_balance.cli import inspection
 from mjx_balance.cli.inspection import TiltTest, describe, inspect, problems, tilt_board
 from mjx_balance.robots.measure import UNLIMITED
 from mjx_balance.sim.scene import Scene
@@ -89,6 +90,22 @@ def test_the_board_is_turned_every_way(bodies: Any, tmp_path: Path) -> None:
     np.testing.assert_allclose(one.torque_share, mirrored, atol=0.01)
     assert one.tilt == pytest.approx(other.tilt, abs=0.01)
     assert one.creep == pytest.approx(other.creep, abs=1e-3)
+
+
+def test_the_worst_way_counts(
+    spot: tuple[Scene, TiltTest], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of each servo's torque, of tilt and of creep; the picture is of the greatest torque."""
+
+    def one(scene: Scene, ways: np.ndarray) -> TiltTest:
+        share = np.zeros((4, 3))
+        share[1, 2], share[3, 0] = (0.5, 0.1) if ways[0] > 0 else (0.2, 0.4)
+        return TiltTest(share, 1.0 + ways[1], 2.0 - ways[1], ways)
+
+    monkeypatch.setattr(inspection, "_tilt_board", one)
+    got = tilt_board(spot[0])
+    assert (got.torque_share[1, 2], got.torque_share[3, 0]) == (0.5, 0.4)
+    assert (got.tilt, got.creep, got.qpos[0]) == (2.0, 3.0, 1)
 
 
 def test_what_does_not_hold_is_said(spot: tuple[Scene, TiltTest]) -> None:

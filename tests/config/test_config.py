@@ -253,6 +253,19 @@ def test_impossible_config_is_refused(values: dict[str, Any], message: str) -> N
         check(changed(**values))
 
 
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"friction_min": 0.9, "friction_max": 0.9},
+        {"push_min": 0.2, "push_max": 0.2, "push_period": 0.2},
+        {"ctrl_dt": 0.4, "sim_dt": 0.4 / 10_000},
+        {"min_replay_size": 64, "replay_capacity": 64},
+    ],
+)
+def test_two_numbers_may_be_equal(values: dict[str, Any]) -> None:
+    check(changed(**values))
+
+
 @pytest.mark.parametrize("value", [None, 3, "paper", PRESETS, TaskConfig()], ids=repr)
 def test_what_is_no_config_is_refused(value: Any) -> None:
     with pytest.raises(ConfigError, match=r"^config is .*; it must be a Config, as `preset`"):

@@ -454,8 +454,17 @@ def test_another_render_mode_is_refused() -> None:
         BalanceVecEnv(0)
 
 
+def test_a_video_has_a_picture_per_decision(config: Config) -> None:
+    assert BalanceGymEnv(config=short(config, 3, ctrl_dt=0.1)).metadata["render_fps"] == 10
+
+
 def test_presets_have_their_own_observations() -> None:
-    assert BalanceGymEnv().observation_space.shape == (34,)
+    paper = BalanceGymEnv().observation_space
+    assert paper.shape == (34,)
+    # 1e4 m, rad/s and m/s^2 in units of 1 cm, 1 deg/s and 9.81 sin(1 deg) m/s^2
+    most = [1e6, 1e4 / np.radians(1), 1e4 / (9.81 * np.sin(np.radians(1)))]
+    np.testing.assert_allclose(paper.high[[0, 4, 33]], most, rtol=1e-6)
+    np.testing.assert_array_equal(paper.low, -paper.high)
     assert BalanceGymEnv(preset="best").reset(seed=0)[0].shape == (136,)
 
 

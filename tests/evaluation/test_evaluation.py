@@ -400,9 +400,10 @@ def test_cells_of_the_envelope_are_inclines_by_speeds(
     config: Config, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A made-up simulation in which a robot falls beyond 8 deg or 5 deg/s, tilted by both."""
-    asked = []
+    asked, shares = [], []
 
-    def roll(scene: Scene, controller: Any, episodes: Episodes, *_: Any, **__: Any):
+    def roll(scene: Scene, controller: Any, episodes: Episodes, duration: float, progress: Any):
+        progress(duration)
         drawn = episodes.scenario
         asked.append((scene.task, drawn))
         incline, rate = np.abs(drawn.targets[:, 0, 0]), drawn.rate
@@ -413,7 +414,8 @@ def test_cells_of_the_envelope_are_inclines_by_speeds(
         return Rollout(config.task, tilt, np.where(fell, 1, 4), np.zeros((len(fell), 1)), None, 1.0)
 
     monkeypatch.setattr(envelope_module, "roll_out", roll)
-    found = envelope(scene, always(STAND), 2, 12.0, 3)
+    found = envelope(scene, always(STAND), 2, 12.0, 3, shares.append)
+    assert shares == [12.0]
     assert found.inclines == list(range(2, 13))
     assert found.rates == [2.5 + 0.25 * k for k in range(15)]
     falls, tilt = np.asarray(found.fall_rate), np.asarray(found.mean_tilt)
@@ -608,5 +610,7 @@ def test_envelope_of_standing_still(scene: Scene) -> None:
 def test_a_policy_is_evaluated_in_its_scene() -> None:
     policy = load_policy("best")
     rollout = run_suite(load_scene(policy.config), observing(policy), "paper", 2, 1.0, 3)
-    result = evaluate(policy, "paper", 2, 1.0, 3)
+    shares: list[float] = []
+    result = evaluate(policy, "paper", 2, 1.0, 3, shares.append)
     assert result["tilt_deg"]["mean"] == rollout.tilt.mean()
+    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])

@@ -68,6 +68,9 @@ def test_circumstances_by_their_draws(config: Config) -> None:
     np.testing.assert_allclose(payload.payload_at[:, 1], 0.1 * others[:, 2] - 0.05)
     np.testing.assert_allclose(friction.friction, 0.4 + 0.6 * others[:, 3])
     np.testing.assert_allclose(gains.gain, 0.8 + 0.4 * others[:, 4])
+    noise = draw(config, "noise", 2, 60.0, 2).rngs
+    own = [np.random.default_rng((2, k, 1)).normal() for k in range(2)]
+    assert [rng.normal() for rng in noise] == own, "from generators of their own"
 
 
 def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
@@ -111,9 +114,12 @@ def test_pushes_happen_in_the_scenarios_of_paper_and_in_no_other_suite(config: C
 
 
 def test_a_config_beyond_the_limits_is_left_as_it_is(config: Config) -> None:
-    """A board that is faster than can be followed is no slower in `fast`."""
+    """A board that is faster or steeper than can be followed is neither slower nor flatter."""
     quick = with_task(config, board_rate=6.0)
     assert draw(quick, "fast", 3, 20, 0).scenario.rate.tolist() == [6.0] * 3
+    high = with_task(config, max_incline=12.0)
+    steep, paper = (draw(high, name, 3, 20, 0).scenario.targets for name in ("steep", "paper"))
+    np.testing.assert_array_equal(steep, paper)
 
 
 @pytest.mark.parametrize(("duration", "targets"), [(5.0, 2), (10.0, 2), (10.1, 3), (60.0, 7)])

@@ -140,6 +140,9 @@ def test_what_was_measured_is_kept(
     monkeypatch.setattr(measuring, "code_digest", lambda: "other")
     measure(6, other)
     assert len(calls) == 8 * 13, "other code"
+    monkeypatch.setattr(Scene, "hash", "of another board")
+    measure(6, other)
+    assert len(calls) == 9 * 13, "another scene"
 
 
 HOSTILE = "<img src=x onerror=alert(1)>"

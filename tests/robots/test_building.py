@@ -378,6 +378,19 @@ def test_the_imu_is_ours(tmp_path: Path, edit: tuple[str, str]) -> None:
     np.testing.assert_allclose(scene.stance.imu, [0, 0, 0, 0, 0, 9.81], atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("site", "imu"),
+    [('<site name="imu"', "[0.1, 0.0, -0.02]"), ('<site name="imu" euler="0 0 1"', '"imu"')],
+)
+def test_the_imu_is_where_the_file_says(tmp_path: Path, site: str, imu: str) -> None:
+    """A place, or a site's; a site that is turned is not, for the axes are the trunk's."""
+    edit = ('<site name="imu"', f'{site} pos="0.1 0 -0.02"')
+    model = scene_of(bodies.write_robot(tmp_path, [edit], imu=imu)).model
+    own = int(model.sensor(f"{ROBOT}gyro").objid[0])
+    np.testing.assert_allclose(model.site_pos[own], (0.1, 0, -0.02))
+    assert model.site_quat[own].tolist() == [1, 0, 0, 0]
+
+
 FEET = {
     "site in a frame": '<frame pos="0 0 -0.2"><site name="{}" pos="0 0 -0.013"/></frame>',
     "cylinder in a frame": (
@@ -486,11 +499,12 @@ def test_torques_of_unusual_motors(kind: str, tmp_path: Path) -> None:
 
 
 def test_the_weakest_motor_of_a_kind_counts(tmp_path: Path) -> None:
-    """An abduction has 20 N m, one knee 30: no leg is told to do more."""
+    """An abduction has 20 N m, by a gear of 2, one knee 30: no leg is told to do more."""
     edits = []
-    for name, torque in (("RH_abduction", 20), ("LF_knee", 30)):
+    for name, limits in (("RH_abduction", 'gear="-2" forcerange="-8 10"'), ("LF_knee", "")):
         servo = f'<position name="{name}"'
-        edits.append((servo, f'{servo} forcerange="-{torque} {torque}"'))
+        edits.append((servo, f"{servo} {limits}"))
+    edits.append(('<joint name="LF_knee"', '<joint name="LF_knee" actuatorfrcrange="-29 30"'))
     robot = find_robot(bodies.write_robot(tmp_path, edits))
     assert (robot.hip_torque, robot.knee_torque) == (20.0, 30.0)
 
@@ -580,6 +594,11 @@ REFUSED: list[tuple[Edits, Edits, str]] = [
     ([], ending(LF="front"), "end is said of some legs only"),
     (
         [],
+        ending(LF="front", RF="front", LH="front", RH="hind"),
+        "3 legs have end front; two must, and two hind",
+    ),
+    (
+        [],
         ending(LF="front", RF="hind", LH="front", RH="hind"),
         "legs LF and LH are said to be front, but they stand at different ends",
     ),
@@ -619,13 +638,25 @@ REFUSED: list[tuple[Edits, Edits, str]] = [
         r"servo_stiffness is 4\d{7}.0; it must be at most 10000000",
     ),
     (turning("-1.2 -1.0"), [], "too short for the board: its legs reach from 0.3"),
+    (turning("-1.5 -0.9"), [], "too short for the board: its legs reach from 0.33"),
     (
         [joint("RF_knee", 'axis="0 0 1"')],
         [],
         r"joint 'RF_knee' of leg RF turns about \(0.00, 0.00, 1.00\)",
     ),
     ([joint("RF_abduction", 'axis="0 1 0"')], [], "joint 'RF_abduction' of leg RF turns about"),
+    ([joint("LH_knee", 'axis="0.03 1 0"')], [], r"leg LH turns about \(0.03, 1.00, 0.00\)"),
     ([], [("trunk =", 'imu = "LF_foot"\ntrunk =')], "imu 'LF_foot' is on"),
+    (
+        [],
+        [('"LF_foot"', '"LF_calf"')],
+        "foot of leg LF is not a sphere geom; say foot_radius, in m",
+    ),
+    (
+        [('"LH_foot" class="foot"', '"LH_foot" class="foot" size="0.025"')],
+        [],
+        "the feet have different radii, LF 0.022, RF 0.022, LH 0.025, RH 0.022; say foot_radius",
+    ),
     ([], [("trunk =", 'imu = "eye"\ntrunk =')], "imu is 'eye', which"),
     ([], [(MODEL, "gone.xml")], "but there is no file .*gone.xml"),
     ([], [(MODEL, "maker.toml")], "maker.toml cannot be read"),
@@ -681,6 +712,11 @@ STRONG = {"knee_torque": "500", "hip_torque": "500"}
             [('pos="0 0 0" mass="6.92"', 'pos="0.5 0 0" mass="6.92"')],
             STRONG,
             "its centre of mass is 22[678] mm ahead of .* stand from -193 to 193 mm",
+        ),
+        (
+            [('pos="0 0 0" mass="6.92"', 'pos="0 -0.5 0" mass="6.92"')],
+            STRONG,
+            "its centre of mass is 22[678] mm right of .* stand from -142 to 142 mm",
         ),
         (
             [],

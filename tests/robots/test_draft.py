@@ -68,6 +68,7 @@ def anonymous() -> mujoco.MjSpec:
 def test_names_do_not_matter(tmp_path: Path, robot: Robot) -> None:
     text, other = drafted(anonymous(), tmp_path)
     assert 'strip = ["arm0_joint", "arm1_joint", "arm2_joint"]' in text
+    assert '\nimu = "imu"\n' in text
     assert [leg.name for leg in other.legs] == ["FL", "FR", "RL", "RR"]
     assert other.total_mass == pytest.approx(robot.total_mass + 0.6)
     for leg, ours in zip(other.legs, robot.legs, strict=True):

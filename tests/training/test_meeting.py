@@ -84,11 +84,11 @@ def test_nobody_waits_for_ever(address: Address, come: Any) -> None:
     assert f"process 0 does not answer at {where} within 0.5 s" in message(outcome)
 
 
-@pytest.mark.parametrize(("index", "count"), [(1, 3), (2, 4)])
+@pytest.mark.parametrize(("index", "count"), [(1, 3), (2, 4), (3, 3)])
 def test_processes_that_count_differently_are_refused(
     index: int, count: int, address: Address, come: Any
 ) -> None:
-    """Two with the same number, and one that knows of another number of them."""
+    """Two with the same number, one that knows of another number of them, one beyond it."""
 
     def late() -> Any:
         time.sleep(0.6)

@@ -230,9 +230,13 @@ def test_a_library_and_a_device_change_the_key(monkeypatch: pytest.MonkeyPatch) 
             changed = program_cache.versions() | {name: "99"}
             patch.setattr(program_cache, "versions", lambda changed=changed: changed)
             assert key() != before
-    with monkeypatch.context() as patch:
-        patch.setattr(jax, "devices", lambda: jax.local_devices()[:1])
-        assert key() != before
+    for module, name, other in (
+        (jax, "devices", jax.local_devices()[:1]),
+        (program_cache, "cores", 99),  # threads of the engine
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, lambda other=other: other)
+            assert key() != before, name
     assert key() == before
 
 
