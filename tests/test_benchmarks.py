@@ -417,9 +417,9 @@ def test_a_part_that_fails_or_takes_too_long_is_listed(monkeypatch: pytest.Monke
     assert none.rows(module.rates, "mjx", [8]) == []
     assert none.failures == ["rates, mjx: no time left"]
     slow = module.Parts(1_000)
-    monkeypatch.setitem(module.SHARES, "rates", 0.0101)
+    monkeypatch.setitem(module.SHARES, "rates", 0.0021)
     assert slow.rows(module.rates, "mjx", [64]) == []
-    assert slow.failures == ["rates, mjx: stopped after 10 s"]
+    assert slow.failures == ["rates, mjx: stopped after 2 s"]
     assert (module.why(-11), module.why(3)) == ("ended by SIGSEGV", "exit code 3")
 
 

@@ -179,10 +179,7 @@ def test_every_presets_program_fits_its_state(
     assert expected <= set(metrics)
 
 
-KERNELS = {
-    "cuda": {"cusolver_potrf_ffi", "cusolver_syevd_ffi"},
-    "tpu": {"Eigh"},
-}
+KERNELS = {"cuda": {"cusolver_potrf_ffi", "cusolver_syevd_ffi"}, "tpu": {"Eigh"}}
 """Platform -> custom calls of its own: MJX's Cholesky, and the whitening's eigenvalues."""
 
 

@@ -52,16 +52,3 @@ def test_a_batch_makes_the_same_updates_on_one_device_and_on_two() -> None:
     assert max(np.abs(leaf).max() for leaf in one) > 0.1
     for alone, shared in zip(one, learnt(2), strict=True):
         np.testing.assert_allclose(shared, alone, rtol=0, atol=1e-6 * np.abs(alone).max())
-
-
-def test_devices_draw_other_keys_and_store_other_envs() -> None:
-    """64 random walks on two devices: each has its own number, and no two envs act alike."""
-    config = DQNConfig(replay_capacity=512, epsilon_start=1.0, epsilon_end=1.0, hidden_sizes=(4,))
-    dqn = DQN(probes.Walk(), QNetwork((4,), (2,)), DQNSpec(config, 64, 512))
-    state, _ = dqn.train_program(8)(dqn.init(0))
-    data = jax.device_get(state.replay.data)
-    one, other = (set(walks.tolist()) for walks in np.split(data.obs[:, 0], 2))
-    assert min(len(one), len(other)) > 32
-    assert not one & other
-    by_env = np.moveaxis(data.action.reshape(2, 8, 32), 1, 2).reshape(64, 8)
-    assert len(np.unique(by_env, axis=0)) > 50

@@ -30,12 +30,11 @@ CONFIG = DQNConfig(
     hidden_sizes=(5,),
 )
 CASES = {
-    "Eq. 1": {},
-    "Double DQN": {"double": True},
-    "clipped": {"max_grad_norm": 0.3},
-    "target never copied": {"target_update_period": 10_000},
-    "whitened": {"whiten_steps": 14, "whiten_floor": 0.05},
+    "Eq. 1": (1, {}),
+    "Double DQN, clipped": (2, {"double": True, "max_grad_norm": 0.3}),
+    "whitened": (2, {"whiten_steps": 14, "whiten_floor": 0.05}),
 }
+"""Devices, and fields of the config."""
 Layers = dict[str, dict[str, np.ndarray]]
 
 
@@ -131,12 +130,13 @@ def forward(layers: Layers, obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return hidden, hidden @ layers["head"]["kernel"] + layers["head"]["bias"]
 
 
-@pytest.mark.parametrize(("case", "devices"), [*((case, 2) for case in CASES), ("Double DQN", 1)])
-def test_parameters_are_those_of_a_second_implementation(case: str, devices: int) -> None:
+@pytest.mark.parametrize(("devices", "changes"), CASES.values(), ids=CASES)
+def test_parameters_are_those_of_a_second_implementation(
+    devices: int, changes: dict[str, Any]
+) -> None:
     """Three iterations beyond the schedule's end, from one row per device."""
-    config = dataclasses.replace(
-        CONFIG, batch_size=devices, replay_capacity=devices, min_replay_size=devices, **CASES[case]
-    )
+    sizes = dict.fromkeys(("batch_size", "replay_capacity", "min_replay_size"), devices)
+    config = dataclasses.replace(CONFIG, **sizes, **changes)
     total = ITERATIONS * devices - devices // 2  # the last iteration counts whole
     spec = DQNSpec(config, devices, total, devices=jax.devices()[:devices])
     dqn = DQN(probes.Turn(), QNetwork(config.hidden_sizes, (2,)), spec)
@@ -198,7 +198,7 @@ def newest(before: Any, after: Any) -> Any:
 
 def test_rows_are_what_the_envs_did(walked: Walked) -> None:
     """Every row belongs to its env; next_obs is the one before the reset."""
-    ends = []
+    ends, actions = [], []
     for before, after, metrics in walked:
         rows = newest(before, after)
         np.testing.assert_array_equal(rows.obs, before.env_state.obs)
@@ -207,9 +207,11 @@ def test_rows_are_what_the_envs_did(walked: Walked) -> None:
         np.testing.assert_allclose(rows.reward, 10 * walk + steps + rows.action / 2, rtol=1e-6)
         np.testing.assert_array_equal(rows.terminated, (steps == 2) & (rows.action == 1))
         ends += rows.terminated[steps == 2].tolist()
+        actions.append(rows.action)
         assert metrics["steps"] == pytest.approx((steps + 1).mean())
         assert int(after.env_steps) == int(before.env_steps) + ENVS
     assert 0.2 < np.mean(ends) < 0.8, "terminations and time-outs"
+    assert len(np.unique(actions, axis=1).T) == ENVS, "every env of both devices draws its own"
     last = walked[-1][1].replay
     assert len(last.data.action) == 3 * ENVS
     assert int(last.size) == 3 * ENVS // 2, "each device counts its own"

@@ -17,11 +17,7 @@ from mjx_balance.policy.heads import Additive
 
 CONFIG = DQNConfig(learning_rate=0.1, learning_rate_end_share=0.1, max_grad_norm=2.0)
 Q_TM1, Q_T, SELECTOR = ([1.0, 2.0, 3.0], [4.0, -1.0, 2.0], [0.0, 9.0, 1.0])
-ERRORS = [
-    (False, 0.0, 0.5 + 0.1 * 4 - 2),
-    (True, 0.0, 0.5 + 0.1 * -1 - 2),
-    (False, 1.0, 0.5 - 2),
-]
+ERRORS = [(False, 0.0, 0.5 + 0.1 * 4 - 2), (True, 0.0, 0.5 + 0.1 * -1 - 2), (False, 1.0, 0.5 - 2)]
 """Double DQN, terminated -> TD error of action 1, reward 0.5, gamma 0.1."""
 
 

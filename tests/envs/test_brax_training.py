@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax import envs
 from fixtures.fleet import with_state
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig, preset
@@ -161,17 +160,6 @@ def test_an_action_can_be_repeated(env: BalanceEnv) -> None:
     found = wrapped_states(wrap(env, EPISODE, 2), EPISODE // 2)
     assert [float(s.done[-1]) for s in found] == [0, 0, 0, 0, 1]
     assert found[1].pipeline_state.env_steps.tolist() == [2] * ENVS
-
-
-@pytest.mark.slow
-def test_braxs_own_wrapping_would_not_do(env: BalanceEnv) -> None:
-    """It leaves memory and clock as the last episode had them: why `wrap` is there."""
-    found = wrapped_states(envs.training.wrap(env, EPISODE), EPISODE + 2)
-    fell = int(np.argmax([s.done[0] for s in found]))
-    assert found[fell].pipeline_state.memory.heights[0].std() > 0.01
-    over = np.asarray([s.done[-1] for s in found[EPISODE:]])
-    np.testing.assert_array_equal(over, 1)
-    assert found[EPISODE].info["truncation"][-1] == 0
 
 
 def test_what_brax_cannot_have_is_refused(env: BalanceEnv) -> None:

@@ -40,6 +40,7 @@ from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.tilt import Scenario
 
 STAND, LEFT_UP = 220, 20 * 21 + 10
+TARGETS = np.asarray([[(4.0, -2.0)], [(-3.0, 1.0)]])
 
 
 def always(action: int):
@@ -64,14 +65,9 @@ def held_boards(config: Config, targets: Any, duration: float) -> Scenario:
 
 def nominal(count: int) -> DomainParams:
     """Parameters that change nothing."""
-    return DomainParams(
-        imu_noise=np.zeros((count, 6)),
-        payload=np.zeros(count),
-        payload_at=np.zeros((count, 3)),
-        friction=np.full(count, 0.8),
-        gain=np.ones(count),
-        delay=np.zeros(count),
-    )
+    zero, one = np.zeros(count), np.ones(count)
+    noise, at = np.zeros((count, 6)), np.zeros((count, 3))
+    return DomainParams(noise, zero, at, friction=0.8 * one, gain=one, delay=zero)
 
 
 def tilts(scene: Scene, qpos: np.ndarray) -> np.ndarray:
@@ -165,8 +161,7 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
     lags = {"command_lags": (0, 2), "imu_mean": 4, "gyro_lags": (0, 20), "accel_lags": (3, 60)}
     task = dataclasses.replace(config.task, **(lags if rich else {}))  # pyright: ignore[reportArgumentType]
     scene = dataclasses.replace(scene, task=task)
-    targets = np.asarray([[(4.0, -2.0)], [(-3.0, 1.0)]])
-    scenarios = Scenario(targets, np.zeros(2), np.asarray((3.5, 2.0)))
+    targets, scenarios = TARGETS, Scenario(TARGETS, np.zeros(2), np.asarray((3.5, 2.0)))
     conditions = nominal(2)._replace(
         payload=np.asarray((0.0, 3.0)),
         payload_at=np.asarray([(0, 0, 0), (0, 0, 0.1)]),
@@ -196,12 +191,8 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
 
 
 def test_pushes_come_between_a_choice_and_its_decision(config: Config, scene: Scene) -> None:
-    """Two scenarios of six decisions, pushed before the second and the fifth: every state.
-
-    Whoever chooses has not seen the push yet.
-    """
-    targets = np.asarray([[(4.0, -2.0)], [(-3.0, 1.0)]])
-    scenarios = Scenario(targets, np.zeros(2), np.full(2, 3.5))
+    """Pushed before the second and the fifth of six; whoever chooses has not seen it yet."""
+    scenarios = Scenario(TARGETS, np.zeros(2), np.full(2, 3.5))
     velocity = np.asarray([[(0.3, -0.1), (0.0, 0.2)], [(-0.2, 0.25), (0.1, 0.1)]])
     singles = [ByHand(scene, 1.0, 0.0, 0.0, False) for _ in range(2)]
     free = scene.model.jnt_dofadr[scene.model.joint("robot/root").id]
@@ -213,7 +204,7 @@ def test_pushes_come_between_a_choice_and_its_decision(config: Config, scene: Sc
             np.testing.assert_allclose(view.qvel[k], single.data.qvel, atol=1e-8)
             if view.env_steps in (1, 4):
                 single.data.qvel[free : free + 2] += velocity[k, (1, 4).index(view.env_steps)]
-            single.decide(actions[view.env_steps, k], targets[k, 0], 3.5)
+            single.decide(actions[view.env_steps, k], TARGETS[k, 0], 3.5)
         return actions[view.env_steps]
 
     pushes = Pushes(velocity, np.asarray([(1, 4), (1, 4)]))
@@ -332,14 +323,9 @@ def test_summary_by_hand(config: Config) -> None:
         "action_mm_settled": None,
         "physics_steps_per_second": pytest.approx(260.0),
     }
-    assert tilt == {
-        "mean": pytest.approx(0.995),
-        "rms": pytest.approx(np.sqrt(199 * 399 / 6) / 100),
-        "p50": pytest.approx(0.995),
-        "p95": pytest.approx(1.8905),
-        "p99": pytest.approx(1.9701),
-        "max": pytest.approx(1.99),
-    }
+    percentiles = {"p50": 0.995, "p95": 1.8905, "p99": 1.9701, "max": 1.99}
+    rms = np.sqrt(199 * 399 / 6) / 100
+    assert tilt == pytest.approx({"mean": 0.995, "rms": rms} | percentiles)
     assert json.loads(json.dumps(summarize(made_up(config), "corner", 12, 7)))["falls"] == 1
 
 
@@ -471,15 +457,10 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_begins(
         run_suite(scene, always(STAND), "paper", 2, 1.0, 0)
 
 
-@pytest.mark.parametrize(
-    ("scenarios", "duration", "named"),
-    [(0, 1.0, "scenarios is 0"), *((1, x, "duration is") for x in (0.0, -1.0, np.nan, np.inf))],
-)
-def test_no_scenarios_and_no_time_are_refused(
-    scene: Scene, scenarios: int, duration: float, named: str
-) -> None:
-    with pytest.raises(EvaluationError, match=named):
-        run_suite(scene, always(STAND), "paper", scenarios, duration, 0)
+def test_no_scenarios_and_no_time_are_refused(scene: Scene) -> None:
+    for count, duration in ((0, 1.0), (1, 0.0), (1, -1.0), (1, np.nan), (1, np.inf)):
+        with pytest.raises(EvaluationError, match="duration is" if count else "scenarios is 0"):
+            run_suite(scene, always(STAND), "paper", count, duration, 0)
 
 
 def watch(scene: Scene, suite: str, count: int, seed: int, first: int = STAND) -> list[View]:

@@ -9,12 +9,7 @@ import pytest
 
 from mjx_balance.config import Config, RandomizationConfig, preset
 from mjx_balance.envs.batch import Episodes, rows
-from mjx_balance.evaluation.suites import (
-    SEEDS,
-    SUITES,
-    SuiteError,
-    draw_suite,
-)
+from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.task.randomization import DRAWS, draw_params

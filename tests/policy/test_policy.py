@@ -9,13 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
-from fixtures.policies import (
-    HEADS,
-    random_params,
-    random_policy,
-    read_manifest,
-    with_head,
-)
+from fixtures.policies import HEADS, random_params, random_policy, read_manifest, with_head
 
 import mjx_balance
 from mjx_balance.config import Config, preset

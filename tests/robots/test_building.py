@@ -42,6 +42,9 @@ def drawing(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return bodies.write_robot(tmp_path, draw(bodies.our_spec()), imu='"imu"', **extra)
 
 
+Edits = list[tuple[str, str]]
+
+
 def scene_of(robot: str) -> Scene:
     return load_scene(check(for_robot(preset("default"), robot)))
 
@@ -223,27 +226,21 @@ def test_rules_of_size_by_hand() -> None:
 def test_the_board_grows_with_the_robot() -> None:
     scene, ours = shipped_scene("b2"), shipped_scene("quadruped")
     length, mass = 1.702, 5.493
-    inertia = mass * length**2
-    fields: list[tuple[Callable[[mujoco.MjModel], np.ndarray], float]] = [
-        (lambda model: model.geom("board/board").size, length),
-        (lambda model: model.body("board/board").mass, mass),
-        (lambda model: model.body("board/board").inertia, inertia),
-        (lambda model: model.actuator("board/board_x").gainprm, inertia),
-        *(
-            (lambda model, x=axis: model.joint(f"board/board_{x}").damping, inertia)
-            for axis in "xy"
-        ),
-        *(
-            (lambda model, x=axis: model.joint(f"board/board_{x}").armature, inertia)
-            for axis in "xy"
-        ),
-    ]
-    for k, (field, factor) in enumerate(fields):
-        large, small = field(scene.model), field(ours.model)
+
+    def measures(model: mujoco.MjModel) -> list[Any]:
+        body, servo = model.body("board/board"), model.actuator("board/board_x")
+        joints = [model.joint(f"board/board_{axis}") for axis in "xy"]
+        turning = [servo.gainprm, *(x.damping for x in joints), *(x.armature for x in joints)]
+        return [model.geom("board/board").size, body.mass, body.inertia, *turning]
+
+    factors = (length, mass, *[mass * length**2] * 6)
+    rows = zip(measures(scene.model), measures(ours.model), factors, strict=True)
+    for k, (large, small, factor) in enumerate(rows):
         np.testing.assert_allclose(large, factor * small, rtol=1e-6, err_msg=str(k))
     board = scene.model.geom("board/board")
     assert board.pos[2] == pytest.approx(-board.size[2]), "it is stood on at the pivot's height"
-    far, near = (load_scene(x.config, visual=True).model.camera("main") for x in (scene, ours))
+    configs = (for_robot(preset("default"), name) for name in ("b2", "quadruped"))
+    far, near = (load_scene(x, visual=True).model.camera("main") for x in configs)
     np.testing.assert_allclose(far.pos, length * near.pos, rtol=1e-6)
 
 
@@ -418,10 +415,7 @@ def test_a_foot_is_where_its_model_draws_it(kind: str, tmp_path: Path, robot: Ro
 
 @pytest.mark.parametrize(
     ("option", "total", "trunk"),
-    [
-        ('settotalmass="30.4"', 30.4, 2 * 6.92),
-        ('boundmass="0.68"', 15.2 + 4 * (0.68 - 0.24), 6.92),
-    ],
+    [('settotalmass="30.4"', 30.4, 2 * 6.92), ('boundmass="0.68"', 15.2 + 4 * (0.68 - 0.24), 6.92)],
 )
 @pytest.mark.filterwarnings("ignore:compiler attribute")
 def test_masses_are_what_the_compiler_makes_them(
@@ -451,23 +445,19 @@ KNEES = {
         turning("-2.69 2.6", *FLIPPED),
         [(-2.69, -0.1), (-2.6, -0.1)] * 2,
     ),
+    "front ones forward, by the file": (
+        turning("-2.6 2.6"),
+        [(0.1, 2.6), (0.1, 2.6), (-2.6, -0.1), (-2.6, -0.1)],
+    ),
 }
 
 
 @pytest.mark.parametrize("kind", KNEES)
 def test_which_way_knees_point(kind: str, tmp_path: Path) -> None:
-    """By their limits; all backward if they can do both."""
+    """By their limits; all backward if they can do both, but for what the file says."""
     edits, turns = KNEES[kind]
-    scene = scene_of(bodies.write_robot(tmp_path, edits))
-    np.testing.assert_allclose(scene.robot.each("knee"), turns, atol=2e-3)
-    check_kinematics(scene)
-
-
-def test_a_file_may_say_which_way_knees_point(tmp_path: Path) -> None:
-    """And front knees may point another way than hind ones."""
-    forward = dict.fromkeys(("LF", "RF"), 'knee = "forward"')
-    scene = scene_of(bodies.write_robot(tmp_path, turning("-2.6 2.6"), **forward))
-    turns = [(0.1, 2.6), (0.1, 2.6), (-2.6, -0.1), (-2.6, -0.1)]
+    said = dict.fromkeys(("LF", "RF"), 'knee = "forward"') if kind.endswith("file") else {}
+    scene = scene_of(bodies.write_robot(tmp_path, edits, **said))
     np.testing.assert_allclose(scene.robot.each("knee"), turns, atol=2e-3)
     check_kinematics(scene)
 
@@ -498,15 +488,25 @@ def test_torques_of_unusual_motors(kind: str, tmp_path: Path) -> None:
     assert (robot.hip_torque, robot.knee_torque) == pytest.approx((23.7, 45.4), rel=1e-5)
 
 
-def test_the_weakest_motor_of_a_kind_counts(tmp_path: Path) -> None:
+SERVO = '<position name="RH_abduction"'
+SERVOS: dict[str, tuple[Edits, tuple[float, float]]] = {
+    "the weakest counts": (
+        [
+            (SERVO, f'{SERVO} gear="-2" forcerange="-8 10"'),
+            ('<joint name="LF_knee"', '<joint name="LF_knee" actuatorfrcrange="-29 30"'),
+        ],
+        (20.0, 30.0),
+    ),
+    "no limits": ([(f'forcerange="-{x} {x}"', "") for x in (23.7, 23.7, 45.4)], (1e4, 1e4)),
+}
+
+
+@pytest.mark.parametrize("kind", SERVOS)
+def test_torques_of_servos(kind: str, tmp_path: Path) -> None:
     """An abduction has 20 N m, by a gear of 2, one knee 30: no leg is told to do more."""
-    edits = []
-    for name, limits in (("RH_abduction", 'gear="-2" forcerange="-8 10"'), ("LF_knee", "")):
-        servo = f'<position name="{name}"'
-        edits.append((servo, f"{servo} {limits}"))
-    edits.append(('<joint name="LF_knee"', '<joint name="LF_knee" actuatorfrcrange="-29 30"'))
+    edits, torques = SERVOS[kind]
     robot = find_robot(bodies.write_robot(tmp_path, edits))
-    assert (robot.hip_torque, robot.knee_torque) == (20.0, 30.0)
+    assert (robot.hip_torque, robot.knee_torque) == torques
 
 
 def test_a_robots_size_is_by_its_furthest_foot_on_either_axis(robot: Robot) -> None:
@@ -560,6 +560,11 @@ def joint(name: str, attribute: str) -> tuple[str, str]:
     return f'<joint name="{name}"', f'<joint name="{name}" {attribute}'
 
 
+def of_last(line: str) -> tuple[str, str]:
+    """An edit that adds a line to the last leg."""
+    return 'foot = "RH_foot"', f'foot = "RH_foot"\n{line}'
+
+
 def ending(**ends: str) -> list[tuple[str, str]]:
     return [(f'"{leg}_foot"', f'"{leg}_foot"\nend = "{end}"') for leg, end in ends.items()]
 
@@ -567,8 +572,7 @@ def ending(**ends: str) -> list[tuple[str, str]]:
 FREE_JOINT, HIP = '<freejoint name="root"/>', '<joint name="LF_hip" class="hip"/>'
 ABDUCTION = '<joint name="LF_abduction" class="abduction"/>'
 NECK = f'<body name="neck">{INERTIAL}<joint name="neck_joint"/></body>'
-LAST_FOOT, MODEL = 'foot = "RH_foot"', "model.xml"
-Edits = list[tuple[str, str]]
+MODEL = "model.xml"
 REFUSED: list[tuple[Edits, Edits, str]] = [
     # edits of the model, edits of the file, message
     ([], [('"trunk"', '"torso"')], "trunk is 'torso', which its model"),
@@ -586,11 +590,7 @@ REFUSED: list[tuple[Edits, Edits, str]] = [
         "foot of leg LF hangs on body 'RF_calf'; it must hang on .* 'LF_calf'",
     ),
     ([], [('"LF_foot"', '"LF_paw"')], "foot of leg LF is 'LF_paw', which"),
-    (
-        [],
-        [(LAST_FOOT, f'{LAST_FOOT}\nside = "left"')],
-        "leg RH is said to be left, but it stands right",
-    ),
+    ([], [of_last('side = "left"')], "leg RH is said to be left, but it stands right"),
     ([], ending(LF="front"), "end is said of some legs only"),
     (
         [],
@@ -612,7 +612,7 @@ REFUSED: list[tuple[Edits, Edits, str]] = [
     ([], [stripping("LF_thigh")], "strip takes joint 'LF_hip' of leg LF, which the leg needs"),
     (
         [],
-        [(LAST_FOOT, f'{LAST_FOOT}\nknee = "forward"')],
+        [of_last('knee = "forward"')],
         "joints 'RH_hip' and 'RH_knee' of leg RH cannot turn far enough .* the knee forward: "
         "the thigh turns from -90 to 200 deg, the calf against it from -156 to -48 deg",
     ),
@@ -679,23 +679,15 @@ def test_what_does_not_fit_is_named(
 
 
 @pytest.mark.parametrize(
-    ("edit", "message"),
+    ("old", "new", "message"),
     [
-        (
-            ('name="LF_knee" class="knee"/>', 'nom="LF_knee"/>'),
-            "'nom'; Element 'joint', line ",
-        ),
-        (
-            ("0.0012 0.0012", "1 0.0012"),
-            "cannot be compiled: .*inertia .*; Element name 'LF_calf'",
-        ),
+        ('name="LF_knee" class="knee"/>', 'nom="LF_knee"/>', "'nom'; Element 'joint', line "),
+        ("0.0012 0.0012", "1 0.0012", "be compiled: .*inertia .*; Element name 'LF_calf'"),
     ],
 )
-def test_mujocos_words_name_the_element(
-    tmp_path: Path, edit: tuple[str, str], message: str
-) -> None:
+def test_mujocos_words_name_the_element(tmp_path: Path, old: str, new: str, message: str) -> None:
     """In one line: it writes them below its complaint."""
-    name = bodies.write_robot(tmp_path, [edit])
+    name = bodies.write_robot(tmp_path, [(old, new)])
     for build in (lambda: find_robot(name), lambda: draft("model.xml", tmp_path / "model.xml")):
         with pytest.raises(RobotError, match=message) as caught:
             build()
@@ -742,13 +734,6 @@ def test_why_it_does_not_stand(
     name = bodies.write_robot(tmp_path, edits, **extra)
     with pytest.raises(ConfigError, match=message):
         scene_of(name)
-
-
-def test_an_unlimited_servo_has_no_limit(tmp_path: Path) -> None:
-    limits = ('forcerange="-23.7 23.7"', 'forcerange="-23.7 23.7"', 'forcerange="-45.4 45.4"')
-    name = bodies.write_robot(tmp_path, [(limit, "") for limit in limits])
-    robot = find_robot(name)
-    assert (robot.hip_torque, robot.knee_torque) == (1e4, 1e4)
 
 
 def test_a_spec_is_new_each_time() -> None:

@@ -12,12 +12,6 @@ from mjx_balance.robots.limits import check_robot, for_robot, greatest_incline
 from mjx_balance.sim.scene import load_scene
 
 
-def test_reach_of_the_legs_at_the_knee_limits(robot: Robot) -> None:
-    """Two equal links of 0.213 m span 0.426 * cos(knee / 2); the foot adds its radius."""
-    assert robot.height_range == pytest.approx((0.1111, 0.4112), abs=1e-4)
-    assert robot.half_track == pytest.approx(0.142)
-
-
 def test_reach_of_unequal_links_by_coordinates(robot: Robot, bodies: Any) -> None:
     """The foot's place as a complex number: the thigh, then the calf turned by the knee."""
     other = bodies.with_legs(robot, thigh=0.2, calf=0.25, knee=(-2.5, -0.5))

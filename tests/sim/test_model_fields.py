@@ -2,6 +2,7 @@
 
 import types
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,7 +38,8 @@ def test_inverse_weights_are_those_that_mujoco_computes(
     nominal = [np.array(values) for values in expected]
     batch.set_const()
     assert np.abs(expected[0] / np.maximum(nominal[0], 1e-9) - 1).max() > 0.2, "it matters"
-    got = randomized_fields(scene, draw_params(WORST, robot, xp.asarray(uniform, xp.float32)))
+    fields = lambda u: randomized_fields(scene, draw_params(WORST, robot, u))  # noqa: E731
+    got = (fields if xp is np else jax.jit(fields))(xp.asarray(uniform, xp.float32))
     rtol = 1e-6 if xp is np else 1e-3
     for name, values in zip(("body_invweight0", "dof_invweight0"), expected, strict=True):
         np.testing.assert_allclose(np.asarray(got[name]), values, rtol=rtol, atol=1e-7)
@@ -62,20 +64,19 @@ def test_a_payload_by_full_tensors_in_the_trunks_own_axes() -> None:
     np.testing.assert_allclose(got["body_ipos"][trunk.id], centre, atol=1e-12)
 
 
-def three_envs(xp: types.ModuleType = np) -> DomainParams:
-    """Nominal; loaded off the centre; loaded on the axis, weak and slippery."""
-    return DomainParams(
-        imu_noise=xp.zeros((3, 6)),
-        payload=xp.asarray((0.0, 4.0, 2.5)),
-        payload_at=xp.asarray(((0.01, 0.02, 0.03), (0.05, -0.04, 0.08), (0.0, 0.0, 0.1))),
-        friction=xp.asarray((0.8, 0.4, 0.6)),
-        gain=xp.asarray((1.0, 1.1, 0.8)),
-        delay=xp.zeros(3),
-    )
+THREE = DomainParams(
+    imu_noise=np.zeros((3, 6)),
+    payload=np.asarray((0.0, 4.0, 2.5)),
+    payload_at=np.asarray(((0.01, 0.02, 0.03), (0.05, -0.04, 0.08), (0.0, 0.0, 0.1))),
+    friction=np.asarray((0.8, 0.4, 0.6)),
+    gain=np.asarray((1.0, 1.1, 0.8)),
+    delay=np.zeros(3),
+)
+"""Nominal; loaded off the centre; loaded on the axis, weak and slippery."""
 
 
 def test_friction_and_gain_reach_every_foot_and_leg_and_nothing_else(scene: Scene) -> None:
-    model, fields = scene.model, randomized_fields(scene, three_envs())
+    model, fields = scene.model, randomized_fields(scene, THREE)
     legs, board = scene.leg_ctrl.ravel(), scene.board_ctrl
     for k, (friction, gain) in enumerate(((0.8, 400.0), (0.4, 440.0), (0.6, 320.0))):
         rows = [(friction, friction, 0.005, 0.0001, 0.0001)] * 4
@@ -93,14 +94,10 @@ def test_friction_and_gain_reach_every_foot_and_leg_and_nothing_else(scene: Scen
         np.testing.assert_array_equal(ours[:, others], np.stack([nominal[others]] * 3))
 
 
-def test_nominal_params_are_the_model(xp: types.ModuleType, scene: Scene) -> None:
-    for name, values in randomized_fields(scene, three_envs(xp)).items():
+def test_nominal_params_are_the_model_and_one_env_in_jax_is_its_row(scene: Scene) -> None:
+    alone = DomainParams(*(jnp.asarray(x[1]) for x in THREE))
+    in_jax = jax.jit(lambda params: randomized_fields(scene, params))(alone)
+    for name, values in randomized_fields(scene, THREE).items():
         assert values.shape == (3, *getattr(scene.model, name).shape)
         np.testing.assert_allclose(values[0], getattr(scene.model, name), rtol=1e-6, atol=1e-9)
-
-
-def test_one_env_in_jax_equals_its_row_in_numpy(scene: Scene) -> None:
-    alone = DomainParams(*(jnp.asarray(x[1]) for x in three_envs()))
-    whole = randomized_fields(scene, three_envs())
-    for name, values in randomized_fields(scene, alone).items():
-        np.testing.assert_allclose(values, whole[name][1], rtol=1e-5, atol=1e-8, err_msg=name)
+        np.testing.assert_allclose(in_jax[name], values[1], rtol=1e-5, atol=1e-8, err_msg=name)

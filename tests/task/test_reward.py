@@ -39,9 +39,7 @@ def test_tilt_of_any_orientation(quat: np.ndarray) -> None:
     assert body_tilt(-quat) == pytest.approx(angle, abs=1e-5)
 
 
-def test_tilt_near_the_upright_is_good_to_a_ten_thousandth_in_float32(
-    xp: types.ModuleType,
-) -> None:
+def test_tilt_near_the_upright_is_good_to_a_ten_thousandth_in_float32(xp: types.ModuleType) -> None:
     """Body leaning by 0 to 0.1 deg, whatever its heading; an arccosine is off by 0.02 deg."""
     rng = np.random.default_rng(0)
     lean = np.linspace(0, 0.1, 50)

@@ -189,8 +189,7 @@ def test_several_seeds_are_averaged_and_listed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("every", "steps"),
-    [(2.5, [60, 100]), (2.0, [40, 80, 100]), (1e-9, CALLS), (1e9, [100])],
+    ("every", "steps"), [(2.5, [60, 100]), (2.0, [40, 80, 100]), (1e-9, CALLS), (1e9, [100])]
 )
 def test_checkpoints_come_by_the_clock(
     every: float,
