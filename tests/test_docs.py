@@ -280,7 +280,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         (evaluate_command, "run_suite", few),
         (evaluation, "policy_scene", scene_of),
         (render, "write", lambda path, *_: path.write_bytes(b"")),
-        (render, "Window", lambda *_: shut),
+        (render, "Window", mock.MagicMock(return_value=shut)),
         (run, "train", lambda wanted, *_: config.check(wanted)),
         (ppo, "train", train_ppo),
         (train_command, "read_run_config", lambda path: config.preset("default")),
