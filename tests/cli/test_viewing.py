@@ -1,5 +1,7 @@
 """A board that keys tilt, and a robot that they push."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,29 @@ def test_a_push_moves_the_robot_once(scene: Scene) -> None:
     way = np.linalg.norm((one.step() - other.step())[1, root : root + 2])
     assert way == pytest.approx(0.4 * 0.008, rel=0.15), "0.4 m/s over two physics steps"
     assert not one.push.any()
+
+
+def test_a_push_grows_with_the_robot(scene: Scene) -> None:
+    """One of twice the size gets 0.8 m/s, in a direction that is drawn."""
+    legs = [dataclasses.replace(x, x=2 * x.x, y=2 * x.y) for x in scene.robot.legs]
+    large = dataclasses.replace(scene.robot, legs=tuple(legs))
+    one = session(scene)
+    one.scene, pushes = dataclasses.replace(scene, robot=large), []
+    for _ in range(20):
+        one.press(PUSH_KEY)
+        pushes.append(one.push)
+    np.testing.assert_allclose(np.linalg.norm(pushes, axis=1), 0.8)
+    assert len(np.unique(np.sign(pushes), axis=0)) == 4
+
+
+def test_a_round_of_a_suite_ends_with_its_scenario(scene: Scene) -> None:
+    """After 300 decisions, though the robot stands."""
+    one = session(scene, suite="paper")
+    one.number = 298
+    one.step()
+    assert (one.number, one.rounds) == (299, 0)
+    one.step()
+    assert (one.number, one.rounds, one.falls) == (0, 1, 0)
 
 
 def test_who_falls_is_put_back_up_on_a_level_board(scene: Scene) -> None:

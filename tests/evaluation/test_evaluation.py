@@ -25,6 +25,7 @@ from mjx_balance.evaluation.rollout import (
     Rollout,
     evaluate,
     observing,
+    policy_scene,
     roll_out,
     run_suite,
     settled_action,
@@ -531,6 +532,11 @@ def test_a_policy_of_another_scene_is_refused() -> None:
     other.scene_hash = "0" * 16
     with pytest.raises(PolicyError, match=r"trained in scene 0{16}, but scenes/ now gives"):
         evaluate(other, "paper", 1, 1.0, 0)
+
+
+def test_a_policy_whose_robot_is_gone_is_refused() -> None:
+    with pytest.raises(PolicyError, match="the policy's robot is 'quadruped', but robot is 'rex'"):
+        policy_scene(load_policy("best"), "rex")
 
 
 def test_the_command_writes_the_contract_and_imports_no_jax(tmp_path: Path) -> None:

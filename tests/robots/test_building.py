@@ -579,6 +579,7 @@ REFUSED: list[tuple[Edits, Edits, str]] = [
     ([], [('"trunk"', '"world"')], "trunk is 'world', which"),
     ([(FREE_JOINT, "")], [], "trunk 'trunk' has no free joint"),
     ([], [('"LF_hip"', '"LF_hop"')], "joint 'LF_hop' of leg LF is none"),
+    ([joint("LF_knee", 'type="slide"')], [], "joint 'LF_knee' of leg LF is no hinge"),
     (
         [],
         [('"LF_hip", "LF_knee"', '"LF_knee", "LF_hip"')],

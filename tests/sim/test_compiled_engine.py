@@ -17,6 +17,7 @@ from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.engines import ffi
 from mjx_balance.sim.engines.jax_engine import JaxEngine, PhysicsState
 from mjx_balance.sim.engines.mujoco import MujocoEngine
+from mjx_balance.sim.engines.mujoco_ffi import _Pool
 from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
@@ -250,6 +251,23 @@ def test_host_functions_see_the_buffers_themselves() -> None:
 def test_an_env_says_which_engine_it_has(compiled: Any) -> None:
     assert compiled.env.backend == "mujoco"
     assert BalanceEnv().backend == "mjx"
+
+
+def test_an_engine_is_used_again_where_its_models_are_right(scene: Scene) -> None:
+    """By the device whose parameters it has had; no two calls at once have the same."""
+    pool, ids = _Pool(scene, 1), np.arange(4)
+    first, second = (DomainParams(**in_double(random_params(k, 4))) for k in (0, 1))
+    with pool._borrowed(4, first) as one, pool._borrowed(4, second) as other:
+        assert one is not other
+        one._randomize(ids, first)
+        other._randomize(ids, second)
+    for _ in range(2):
+        with pool._borrowed(4, first) as again:
+            assert again is one
+        with pool._borrowed(4, second) as again:
+            assert again is other
+    with pool._borrowed(4, None) as plain:
+        assert plain not in (one, other)
 
 
 def test_engines_of_other_threads_have_other_names(scene: Scene) -> None:

@@ -19,7 +19,7 @@ import pytest
 
 from mjx_balance.config import PRESETS, Config
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.files.run_folder import RunFolder, RunFolderError
 from mjx_balance.training import checkpoints, loop
 from mjx_balance.training import run as run_module
 from mjx_balance.training.loop import STOPPING, Interrupts, Run, learn, measured
@@ -148,6 +148,17 @@ def test_every_call_is_logged_and_the_end_is_saved(
     assert "seeds" not in logged(folder)[-1], "there is one"
     for name, value in last.items():
         assert drawn(folder, name)[100] == pytest.approx(value, rel=1e-6)
+
+
+def test_a_run_says_which_seeds_it_trains(folder: RunFolder, display: Any) -> None:
+    folder.config.write_text("{}")
+    for count, seeds in ((1, "seed 5"), (3, "seeds 5 to 7")):
+        run = dataclasses.replace(run_of(seed=5, num_seeds=count), folder=folder, display=display)
+        run_module._announce(run)
+        assert f"{folder.path}: preset paper, {seeds}, 4 envs on" in display.lines[-1]
+    folder.config.unlink()
+    with pytest.raises(RunFolderError, match=r"process 0 does not see .*; choose a folder that"):
+        run_module._announce(run)
 
 
 def test_checkpoints_are_at_most_a_minute_old() -> None:

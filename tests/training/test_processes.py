@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mjx_balance.machine import core_ids, cores
 from mjx_balance.training import processes
 from mjx_balance.training.meeting import ProcessError
 from mjx_balance.training.processes import ALONE, Processes, find_cluster, resolve, share_machine
@@ -127,6 +128,15 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatc
     assert share(("a", [0, 1]), ("a", [2, 3, 4])) == ([[0, 1], [2, 3, 4]], {2})
     assert share(("a", [0, 1]), ("b", [0, 1])) == ([[0, 1], [0, 1]], {2})
     assert share(*[("a", [4, 5])] * 3) == ([[4, 5]] * 3, {2}), "too few to share"
+
+
+def test_cores_are_those_that_a_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a machine of 8; all of them where no system call tells."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {5, 2, 3}, raising=False)
+    assert (core_ids(), cores()) == ([2, 3, 5], 3)
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert (core_ids(), cores()) == (list(range(8)), 8)
 
 
 @pytest.fixture
