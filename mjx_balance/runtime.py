@@ -43,14 +43,11 @@ MOMENTARY = ("height",)  #: sensors with one sample per decision and no history
 MOST_READ = 1_000_000  #: greatest number of samples that all inputs together average
 GYRO_MOST = 35.0  #: greatest gyro reading, rad/s; the widest usual range is 2,000 deg/s
 ACCEL_MOST = 160.0  #: greatest accelerometer reading, m/s^2; a usual range is 16 g
-WEIGHT = (0.5 * 9.81, 1.5 * 9.81)
-"""Least and greatest norm of a decision's mean acceleration, m/s^2; pushes give 9.2 to 11."""
-LEAN_MOST = 40.0
-"""Greatest angle of that mean from z, deg. A fall has 6 deg, but a push can look like 29."""
+WEIGHT = (0.5 * 9.81, 1.5 * 9.81)  #: norm of the mean acceleration, m/s^2; pushes give 9.2 to 11
+LEAN_MOST = 40.0  #: greatest angle of it from z, deg; a fall has 6, but a push can look like 29
 AWAY_MOST = 0.5  #: greatest error of a joint at a decision, rad; pushes give 0.03
 KNEE_SLACK = 0.1  #: tolerance of a knee's reading beyond its stops, rad
-LATE_SAMPLES = 5
-"""Longest time between two calls, and greatest error of a decision's length, sample periods."""
+LATE_SAMPLES = 5  #: greatest delay of a call or decision, sample periods
 
 
 class PolicyFileError(ValueError):
@@ -297,10 +294,7 @@ class Controller:
 
 
 class _Inputs:
-    """The network's inputs, from the rows of the manifest's `inputs`.
-
-    An input is (mean of `window` samples - offset) / scale; its newest sample is `lag` samples old.
-    """
+    """The network's inputs: (mean of `window` samples from `lag` on - offset) / scale."""
 
     def __init__(self, rows: list[dict[str, Any]], legs: int) -> None:
         channels = {"height": legs, "command": legs, "gyro": 3, "accelerometer": 3}

@@ -191,7 +191,7 @@ def test_legs_are_held_within_their_reach(tmp_path: Path, config: Config, robot:
     rig = Rig(tmp_path / "p")
     targets = rig.steps(400)[-1]
     low, high = robot.height_range
-    expected = joint_angles(robot, np.where(robot.left, high, low))
+    expected = joint_angles(robot, np.where(robot.each("left"), high, low))
     np.testing.assert_allclose(targets, expected, rtol=0, atol=1e-9)
 
 

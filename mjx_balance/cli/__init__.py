@@ -19,11 +19,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command with these arguments, or those of `sys.argv`.
-
-    Returns:
-      The exit code: 0, 1 for failures, 2 for invalid input, 130 after Ctrl-C.
-    """
+    """Runs a command; returns 0, 1 for failures, 2 for invalid input, 130 after Ctrl-C."""
     from mjx_balance.cli.common import HELP, complain
 
     name, *argv = list(sys.argv[1:] if arguments is None else arguments) or [""]

@@ -46,10 +46,7 @@ def with_values(dqn: DQNConfig, values: Mapping[str, float]) -> DQNConfig:
 
 
 def expand_runs(config: Config) -> list[Config]:
-    """Returns the config of each run: every combination of the sweep with `num_seeds` seeds.
-
-    Run k has the seed `config.seed + k`, because results are named by seed.
-    """
+    """Returns a config per run: each combination with `num_seeds` seeds; run k has `seed + k`."""
     repeated = [x for x in sweep_grid(config) for _ in range(config.num_seeds)]
     return [
         dataclasses.replace(

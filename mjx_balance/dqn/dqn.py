@@ -62,10 +62,8 @@ class DQNSpec:
     devices: Sequence[Any] = dataclasses.field(default_factory=jax.devices)  #: the mesh
     num_seeds: int = 1  #: independent runs in one program
     symmetries: Symmetries | None = None  #: reflections of the env, for `config.mirror`
-    action_factors: tuple[int, ...] | None = None
-    """Levels of each digit of an action index, for the exploration noise; None: one digit."""
-    first_reset: Callable[[jax.Array], State] | None = None
-    """PRNG key -> an env at the start of a run; None: `Env.reset`."""
+    action_factors: tuple[int, ...] | None = None  #: levels of each digit of an action; None: one
+    first_reset: Callable[[jax.Array], State] | None = None  #: an env at the start
     sweep: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
     """Field of `config` -> its value in every run."""
 
@@ -97,10 +95,7 @@ class DQNSpec:
 
 
 class TrainState(NamedTuple):
-    """The complete state of a run, for checkpoints.
-
-    With several seeds, every leaf has a leading seed axis.
-    """
+    """The complete state of a run, for checkpoints; several seeds are a leading axis."""
 
     params: Params  #: for whitened observations, if `whiten_steps` is positive
     target_params: Params  #: for raw observations: each copy includes the whitening at its time
@@ -125,13 +120,10 @@ class UpdateState(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class DQN:
-    """Trains a Q-network on a brax env.
+    """Trains a Q-network on an unbatched brax env with `action_size` discrete actions.
 
-    Args:
-      env: unbatched, with `action_size` discrete actions; `info["truncation"]`, if there,
-        marks time-outs.
-      network: maps (..., obs_size) to (..., action_size).
-      spec: the numbers of the run.
+    `info["truncation"]`, if there, marks time-outs. The network maps (..., obs_size) to (...,
+    action_size).
     """
 
     env: Env

@@ -32,8 +32,7 @@ def device_key(key: PRNGKeyArray) -> PRNGKeyArray:
 def mean_over_devices(tree: T) -> T:
     """Mean of every array over the devices, in one collective.
 
-    On CPUs, an all-gather has half the steps of a ring reduction, and its sum follows the order of
-    the devices, whatever the number of processes. Accelerators use `pmean`.
+    On CPUs, an all-gather has half the steps of a ring reduction, and sums in the order of devices.
     """
     flat, unflatten = ravel_pytree(tree)
     mean = jax.lax.platform_dependent(

@@ -1,8 +1,4 @@
-"""A uniform replay buffer as a frozen state and pure functions: `init`, `add`, `sample`.
-
-Transitions arrive in batches of a fixed size, one row per env. The capacity is a whole number of
-batches, so every write is one contiguous block.
-"""
+"""A uniform replay buffer as a frozen state and pure functions: `init`, `add`, `sample`."""
 
 from typing import NamedTuple, TypeAlias
 

@@ -115,10 +115,7 @@ class BalanceEnv(Env):
         return State(start, obs, zero, zero, metrics, info)  # pyright: ignore[reportArgumentType]
 
     def reset_staggered(self, rng: jax.Array) -> State:
-        """`reset`, but with a random time limit of 1 to `episode_length` decisions.
-
-        For the first episodes of a batch, which would otherwise all time out together.
-        """
+        """`reset` with a random time limit, so that first episodes do not time out together."""
         key_reset, key_length = jax.random.split(rng)
         state = self.reset(key_reset)
         length = jax.random.randint(key_length, (), 1, self.config.task.episode_length + 1)

@@ -1,7 +1,4 @@
-"""`BatchEnv`: many envs in plain MuJoCo, in NumPy. Evaluation, Gymnasium and the viewer run on it.
-
-No JAX. `BalanceEnv` takes the same decisions for one env inside a jitted program.
-"""
+"""`BatchEnv`: many envs in plain MuJoCo, in NumPy, as `BalanceEnv` is one in JAX. No JAX."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -25,8 +22,7 @@ class Episodes(NamedTuple):
     scenario: Scenario  #: where the boards go
     params: DomainParams | None = None  #: None: nominal
     pushes: Pushes | None = None  #: None: no pushes
-    rngs: Sequence[np.random.Generator] = ()
-    """Of each episode, for its sensor noise; needed where `params` has some."""
+    rngs: Sequence[np.random.Generator] = ()  #: of each episode, for its sensor noise
 
 
 def draw_episodes(

@@ -1,7 +1,4 @@
-"""The task as Gymnasium's envs, in plain MuJoCo: one env, or many at once. No JAX.
-
-`import mjx_balance` registers them.
-"""
+"""Gymnasium's envs in plain MuJoCo, one or many at once; `import mjx_balance` registers them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -65,19 +62,11 @@ class _Balance:
     ):
         """Builds the scene.
 
-        Args:
-          preset: name of the config; "default" if neither is given.
-          config: instead of preset and robot; its task, robot and randomisation are what counts.
-          action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
-            `action_max`, -1 to 1.
-          render_mode: "human", a window in which every decision takes its time (of one env);
-            "rgb_array"; or none.
-          robot: as `Config.robot`, for which the preset is made; our own if none.
-
-        Raises:
-          ConfigError: for an unknown preset, robot or kind of action, or a config that cannot be
-            run.
-          UnsupportedMode: for another render mode.
+        A preset, "default" if none, is made for the robot, ours if none; a config replaces both.
+        `action` is "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
+        `action_max`, -1 to 1. `render_mode` is "human", a window in which every decision takes its
+        time (of one env), "rgb_array" or None. Raises `ConfigError` for an unknown preset, robot or
+        kind of action, or a config that cannot be run; `UnsupportedMode` for another render mode.
         """
         known = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in known:

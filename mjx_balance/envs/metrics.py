@@ -4,10 +4,7 @@ from typing import Literal, NamedTuple
 
 
 class Metric(NamedTuple):
-    """A row of an env's table `metrics`: its name in `State.metrics` -> how its mean is logged.
-
-    A metric without a row is logged under its own name, as a mean over decisions.
-    """
+    """A row of an env's table `metrics`: how a metric's mean is logged, if not as it is."""
 
     name: str | None = None  #: logged name; None: its own
     per: Literal["decision", "minute", "call"] = "decision"

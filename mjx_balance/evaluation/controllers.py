@@ -35,8 +35,7 @@ class View(NamedTuple):
     delayed: np.ndarray  # (n,) whether actions are taken one decision later
 
 
-Controller = Callable[[View], np.ndarray]
-"""Maps the view of n scenarios to action indices (n,), or to a_x and a_y (n, 2), m."""
+Controller = Callable[[View], np.ndarray]  #: action indices (n,), or a_x and a_y (n, 2), m
 
 
 class ControllerError(InputError):
@@ -139,8 +138,7 @@ class ImuPD(AttitudePD):
 class Predictive:
     """Model predictive control on true attitude, response, latency and a forecast of the board.
 
-    Minimises the squared tilt over every physics step of the next `HORIZON` decisions,
-    within the action limits, takes the first action that is still open and plans again.
+    Minimises the squared tilt over all physics steps of the next `HORIZON` decisions.
     """
 
     def __init__(self, scene: Scene, forecast: Callable[..., np.ndarray]):

@@ -25,8 +25,7 @@ from mjx_balance.task.actions import action_table
 from mjx_balance.task.reward import failed
 from mjx_balance.task.step import Outcome
 
-TILT_COPIES = 3
-"""Arrays of every scenario's tilt at every step that a summary needs at once, float64."""
+TILT_COPIES = 3  #: arrays of all tilts, float64, that a summary needs at once
 SETTLED_SECONDS = 3.0  #: end of every target's period in which the board has long been at rest, s
 Progress = Callable[[float], None]  #: takes the share done
 
@@ -47,8 +46,7 @@ class Rollout:
     task: TaskConfig
     tilt: np.ndarray  #: (scenarios, steps) body tilt, deg; fail_tilt from a fall on
     fell_at: np.ndarray  #: (scenarios,) step of the fall, or the number of steps
-    action_mm: np.ndarray
-    """(scenarios, decisions) mean of the two axes' height changes, mm; NaN after a fall."""
+    action_mm: np.ndarray  #: (scenarios, decisions) mean height change, mm; NaN after a fall
     qpos: np.ndarray | None  #: (scenarios, steps, nq), if recorded
     seconds: float  #: time spent
 
@@ -157,11 +155,7 @@ def summarize(rollout: Rollout, suite: str, duration: float, seed: int) -> dict[
 
 
 def settled_action(rollout: Rollout) -> float | None:
-    """Mean commanded height change, mm per decision and axis, while the board rests.
-
-    Taken over the last `SETTLED_SECONDS` of every period of a standing robot; None if
-    there is no such decision.
-    """
+    """Mean height change, mm, in each period's last `SETTLED_SECONDS`; None without decisions."""
     task = rollout.task
     until = task.target_period - np.arange(rollout.action_mm.shape[1]) * task.ctrl_dt
     until = until % task.target_period

@@ -21,10 +21,7 @@ def interquartile_mean(values: Sequence[float] | np.ndarray, axis: int = 0) -> A
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:
-    """95% percentile bootstrap interval of the interquartile mean.
-
-    A single value, or equal values, is its own interval.
-    """
+    """95% percentile bootstrap interval of the interquartile mean; equal values are their own."""
     from scipy import stats
 
     if min(values) == max(values):

@@ -53,16 +53,12 @@ SUITES: dict[str, Suite] = {
     "steep": Suite(steep=True),
 }
 """By the names of `mjx-balance evaluate --suite`."""
-HEADLINE = ("paper", "corner")
-"""Suites of the figures that come first: after training, in reports and tables."""
+HEADLINE = ("paper", "corner")  #: evaluated after training, in reports and tables
 
 
 @dataclasses.dataclass(frozen=True)
 class Seeds:
-    """Seeds of scenarios, one per purpose, so that none is used for two.
-
-    Training draws from other generators and sees none of them.
-    """
+    """Seeds of scenarios, one per purpose; training draws from other generators."""
 
     final: int = 1_000_000  # evaluation after training
     record: int = 2_000_000  # rollouts drawn as figures

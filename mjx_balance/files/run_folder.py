@@ -1,7 +1,4 @@
-"""The run folder: file names, atomic writes, the lock, and the checks before a resume. No JAX.
-
-All writes are atomic, so that a run can be killed at any moment and resumed.
-"""
+"""The run folder: file names, atomic writes, the lock, and the checks before a resume. No JAX."""
 
 import contextlib
 import json
@@ -20,8 +17,7 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-READ_AT_MOST = 2**20
-"""Greatest size of a JSON file of a run, bytes; usual ones have some kilobytes."""
+READ_AT_MOST = 2**20  #: greatest size of a JSON file of a run, bytes; usual ones have some kB
 
 
 class RunFolderError(InputError):
@@ -34,16 +30,13 @@ class RunFolder:
     def __init__(self, path: Path):
         self.path = path
         self.config = path / "config.json"
-        self.provenance = path / "provenance.json"
-        """Scene, engine and versions at the start of the run."""
+        self.provenance = path / "provenance.json"  #: scene, engine, versions at the start
         self.lock = path / ".lock"
         self.metrics = path / "metrics.jsonl"
         self.tensorboard = path / "tensorboard"
         self.checkpoints = path / "checkpoints"
-        self.validated = path / "validated"
-        """Policies validated during training, in folders named by env steps."""
-        self.seeds_summary = path / "seeds.json"
-        """With several seeds: evaluation and validation of each, and the choice among them."""
+        self.validated = path / "validated"  #: policies, in folders named by env steps
+        self.seeds_summary = path / "seeds.json"  #: all seeds' results, and the choice
         self.seeds = path / "seeds"  #: with several seeds: the policy and evaluation of each
         self.sweep = path / "sweep.json"  #: results of the combinations of a sweep, the best first
         self.policy = path / "policy.safetensors"
@@ -111,10 +104,7 @@ def create_run_folder(
 
 @contextlib.contextmanager
 def locked(folder: RunFolder) -> Iterator[None]:
-    """Locks a run against other processes; raises `RunFolderError` if another one holds the lock.
-
-    The operating system unlocks it if this process dies.
-    """
+    """Locks a run while this process lives; raises `RunFolderError` if another one has the lock."""
     with folder.lock.open("a+b") as file:
         try:
             if sys.platform == "win32":

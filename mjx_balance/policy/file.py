@@ -16,15 +16,11 @@ from mjx_balance.policy.manifest import PolicyError, naming, upgrade
 from mjx_balance.policy.network import Policy
 
 MOST_BYTES = 64 * 2**20
-MOST_MANIFEST = 4 * 2**20
-"""Greatest size of a manifest, characters; larger files and manifests are refused."""
+MOST_MANIFEST = 4 * 2**20  #: greatest size of a manifest, characters
 
 
 def flat_weights(params: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Flattens a flax network's variables to {name: float32 array}, e.g. `hidden_0/kernel`.
-
-    Arrays by name stay as they are.
-    """
+    """Flattens a flax network's variables to {name: float32 array}, e.g. `hidden_0/kernel`."""
     weights = {}
     for layer, value in params.get("params", params).items():
         arrays = value.items() if isinstance(value, Mapping) else [("", value)]

@@ -33,8 +33,7 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "axes.titlelocation": "left",
 }
-styled = mpl.rc_context(STYLE)
-"""Decorates a function so that it draws in the package's style, whatever the caller's."""
+styled = mpl.rc_context(STYLE)  #: decorates a function that draws in this style
 
 
 def draw_figures(

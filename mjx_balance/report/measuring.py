@@ -38,10 +38,8 @@ _Shares = dict[str, dict[str, Annotated[list[Finite], Len(BINS, BINS)]]]
 class Measurements:
     """Results of a policy and of the baselines on the same scenarios."""
 
-    results: dict[str, dict[str, dict[str, Any]]]
-    """Controller -> suite -> fields of `reading.SuiteResult`."""
-    shares: dict[str, dict[str, list[float]]]
-    """Controller -> suite -> (BINS,) share of the physics steps per bin of tilt (`edges`)."""
+    results: dict[str, dict[str, dict[str, Any]]]  #: controller -> suite -> `SuiteResult`
+    shares: dict[str, dict[str, list[float]]]  #: controller -> suite -> share per bin of tilt
     envelope: Envelope  #: of the policy
 
 

@@ -100,10 +100,7 @@ def _policy_sections(
 
 
 def seeds_statistics(run: Run, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
-    """Suite -> statistics over the seeds of `run` and of those `runs` that differ only in seed.
-
-    Empty if there are fewer than two seeds.
-    """
+    """Suite -> statistics over the seeds of runs like `run`; empty for fewer than two seeds."""
 
     def recipe(config: Config | None) -> Config | None:
         return config and dataclasses.replace(config, seed=0, num_seeds=1)

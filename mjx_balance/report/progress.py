@@ -4,19 +4,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
+from rich import progress as bars
 from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
 from rich.panel import Panel
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
 from mjx_balance.evaluation.suites import HEADLINE
@@ -68,8 +60,8 @@ class Display:
             self.say(f"{name} ...")
             yield lambda share: None
             return
-        columns = (SpinnerColumn(), TextColumn(escape(name)), BarColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=self.console, transient=True) as progress:
+        columns = (bars.SpinnerColumn(), escape(name), bars.BarColumn(), bars.TimeRemainingColumn())
+        with bars.Progress(*columns, console=self.console, transient=True) as progress:
             task = progress.add_task(name, total=1.0)
             yield lambda share: progress.update(task, completed=share)
 
@@ -78,15 +70,15 @@ class Display:
         """Shows training from `done` to `total` decisions; call `update` inside."""
         self._total, self._done_at_start = total, done
         self._start = self._last = time.perf_counter()
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("training"),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TextColumn("decisions"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(elapsed_when_finished=False),
+        self._progress = bars.Progress(
+            bars.SpinnerColumn(),
+            "training",
+            bars.BarColumn(bar_width=None),
+            bars.MofNCompleteColumn(),
+            "decisions",
+            bars.TimeElapsedColumn(),
+            "left",
+            bars.TimeRemainingColumn(elapsed_when_finished=False),
         )
         self._task = self._progress.add_task("training", total=total, completed=done)
         if not self.console.is_terminal:

@@ -1,7 +1,4 @@
-"""Reads a run folder that may be incomplete, damaged or foreign.
-
-Checks every value that the report uses, and ignores the rest of each file.
-"""
+"""Reads of a run folder, incomplete, damaged or foreign, what the report uses, and checks it."""
 
 import dataclasses
 import math
@@ -40,8 +37,7 @@ class Run:
     """The readable parts of a run folder."""
 
     path: Path
-    missing: list[str] = dataclasses.field(default_factory=list)
-    """One sentence per missing or unusable part."""
+    missing: list[str] = dataclasses.field(default_factory=list)  #: a sentence per missing part
     config: Config | None = None
     metrics: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     policy: Policy | None = None

@@ -217,8 +217,7 @@ class _FootPlace(NamedTuple):
 
     body: mujoco.MjsBody
     element: mujoco.MjsGeom | mujoco.MjsSite | None = None  #: the geom or site that the file names
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """In the body's frame, m, without an element."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: in the body's frame, m
 
     @property
     def sphere(self) -> mujoco.MjsGeom | None:
@@ -257,10 +256,7 @@ def _foot_radius(file: RobotFile, feet: dict[str, _FootPlace]) -> float:
 
 
 def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
-    """Makes explicit the inertia that bodies get from their geoms and from compiler options.
-
-    The geoms may be deleted later.
-    """
+    """Makes explicit the inertia from geoms, which may be deleted later, and compiler options."""
     bodies = [trunk, *trunk.find_all(mujoco.mjtObj.mjOBJ_BODY)]
     compiler = spec.compiler
     by_geoms = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
@@ -326,8 +322,7 @@ def _free_name(elements: list, name: str) -> str:
 def _leave_geoms(spec: mujoco.MjSpec, feet: list[mujoco.MjsGeom], visual: bool) -> None:
     """Deletes all geoms but the feet and, with `visual`, those that show the robot.
 
-    Without visual geoms in the model, the collision geoms show it. No geom that is left collides by
-    itself: contact pairs join the feet and the board.
+    No geom that is left collides by itself: contact pairs join the feet and the board.
     """
     names = {foot.name for foot in feet}
     others = [geom for geom in spec.geoms if geom.name not in names]
@@ -371,11 +366,7 @@ def _align(
 
 
 def _forward(file: RobotFile, data: mujoco.MjData) -> np.ndarray:
-    """Direction from the hind hips to the front ones, (2,).
-
-    If the file does not name the ends, it is the longer side of the hips' rectangle, toward
-    positive x or y.
-    """
+    """Direction from hind to front hips, (2,); their longer side if the file names no ends."""
     abductions = [data.joint(leg.joints[0]) for leg in file.legs]
     hips = np.asarray([joint.xanchor[:2] for joint in abductions])
     ends = [leg.end for leg in file.legs]

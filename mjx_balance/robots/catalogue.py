@@ -52,10 +52,7 @@ def robot_xml(name: str) -> str:
 
 
 def find_robot(name: str) -> Robot:
-    """Returns a robot's numbers; as `robot_file` and `build.build`.
-
-    Cached while its file and model stay the same.
-    """
+    """Returns a robot's numbers, cached while its files stay the same; raises as `build.build`."""
     file = robot_file(name)
     return _build_robot(file, model_path(file.model, file.folder).stat().st_mtime_ns)
 

@@ -41,10 +41,7 @@ def greatest_incline(task: TaskConfig, robot: Robot) -> float:
 
 
 def authority(task: TaskConfig, robot: Robot) -> float:
-    """Greatest board rate that the actions can follow on both axes, deg/s.
-
-    It is `action_max` per decision over the robot's lever.
-    """
+    """Greatest board rate that the actions can follow on both axes, by the robot's lever, deg/s."""
     return math.degrees(task.action_max / task.ctrl_dt / robot.lever)
 
 

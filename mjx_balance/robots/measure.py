@@ -12,13 +12,10 @@ from mjx_balance.files.validation import check_types
 from mjx_balance.robots.robot import OUR_LEVER, OUR_MASS, Body, Leg, Robot
 from mjx_balance.robots.schema import LegFile, RobotError, RobotFile
 
-LEVEL = math.cos(math.radians(1.0))
-"""Cosine of the greatest angle between a joint's axis and the trunk's axis."""
+LEVEL = math.cos(math.radians(1.0))  #: greatest angle of a joint's axis to the trunk's
 SLACK = 1e-3  #: tolerance of an abduction's limits, rad
-FREE_KNEE = (0.1, 2.7)
-"""Least and greatest bend of a knee without limits, rad: almost straight, almost on the thigh."""
-WHOLE_TURNS = [2 * math.pi * k for k in (0, 1, -1, 2, -2)]
-"""Offsets of a model's joint angles from ours, rad."""
+FREE_KNEE = (0.1, 2.7)  #: bend of a knee without limits, rad: almost straight, on the thigh
+WHOLE_TURNS = [2 * math.pi * k for k in (0, 1, -1, 2, -2)]  #: between the model's angles and ours
 JOINT_ACTUATORS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 UNLIMITED = 1e4  #: torque limit of servos if neither file nor model gives one, N m
 
@@ -26,8 +23,7 @@ UNLIMITED = 1e4  #: torque limit of servos if neither file nor model gives one, 
 OUR_LEG, OUR_HALF_TRACK, OUR_HEIGHT = 0.426, 0.142, 0.35
 OUR_STIFFNESS, OUR_DAMPING, OUR_ARMATURE = 400.0, 16.0, 0.02
 OUR_ACTION = 0.003  # paper Eq. 3
-STRETCH = 0.77
-"""Standing length of the legs as a share of their full length: 0.35 m for ours (paper 3.1)."""
+STRETCH = 0.77  #: standing length of the legs, of their full length: 0.35 m for ours (paper 3.1)
 SMALLEST = 0.01  #: least mass and size relative to ours
 INCLINE = 7.0  #: board angle on both axes at once that the legs must compensate, deg (paper 3.1)
 
@@ -128,10 +124,7 @@ def pose(
 
 
 def _standing_height(robot: Body) -> float:
-    """Body height with the legs at `STRETCH` of their length, m.
-
-    Clipped, so that the legs can compensate a board at `INCLINE` on both axes.
-    """
+    """Body height with legs at `STRETCH`, within what a board at `INCLINE` needs, m."""
     room = math.tan(math.radians(INCLINE)) * (robot.half_length + robot.half_track)
     low, high = robot.height_range
     if high - low < 2 * room:
@@ -216,11 +209,7 @@ def _check_foot(model: mujoco.MjModel, leg: LegFile, foot: str) -> None:
 def _level_pose(
     model: mujoco.MjModel, trunk: str, leg: LegFile
 ) -> tuple[mujoco.MjData, float, tuple[float, float, float]]:
-    """Turns the abduction until the hip's axis is level.
-
-    Returns:
-      The pose, the roll of the hip's axis at joint angles 0, rad, and the joints' signs, +-1.
-    """
+    """The pose with a level hip axis, its roll at joint angles 0, rad, and the joints' signs."""
     drawn = pose(model, trunk)
     abduction, hip, knee = leg.joints
     forward = _sign(drawn, leg, abduction, "an abduction turns about forward", 0)
@@ -330,10 +319,7 @@ def _with_corners(legs: list[Leg]) -> tuple[Leg, ...]:
 
 
 def _check_corners(file: RobotFile, legs: tuple[Leg, ...]) -> None:
-    """Checks that each corner has one leg, as the file says, and that left and right knees agree.
-
-    Knees of left and right may point different ways if the file sets both.
-    """
+    """Checks each corner's leg against the file, and that left and right knees bend alike."""
     corners: dict[tuple[str, str], Leg] = {}
     for words, leg in zip(file.legs, legs, strict=True):
         side, end = "left" if leg.left else "right", "front" if leg.front else "hind"

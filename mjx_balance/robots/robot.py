@@ -63,16 +63,6 @@ class Body:
     total_mass: Number
 
     @property
-    def left(self) -> tuple[bool, ...]:
-        """Whether each leg is on the left side."""
-        return tuple(leg.left for leg in self.legs)
-
-    @property
-    def front(self) -> tuple[bool, ...]:
-        """Whether each leg is in front."""
-        return tuple(leg.front for leg in self.legs)
-
-    @property
     def half_length(self) -> float:
         """Greatest fore-aft distance of a foot from the trunk's origin, m."""
         return max(abs(leg.x) for leg in self.legs)
@@ -119,6 +109,5 @@ class Robot(Body):
     servo_damping: Number  #: damping of the leg joints, N m s / rad
     servo_armature: Number  #: inertia of rotor and gear at the joint, kg m^2
     foot_friction: Number  #: sliding friction of a foot on the board
-    body_height: Number
-    """Standing height of the trunk's origin above the board, foot radius included, m."""
+    body_height: Number  #: standing height of the trunk's origin, foot radius included, m
     action_max: Number  #: greatest height change of one decision on one axis, m

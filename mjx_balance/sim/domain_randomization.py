@@ -62,8 +62,7 @@ class _AtRest(NamedTuple):
     """Jacobians and inertia of the nominal model at qpos0."""
 
     inertia: Float[np.ndarray, "nv nv"]  #: without the trunk's part
-    centres: Float[np.ndarray, "nbody 3 nv"]
-    """Of the bodies' centres of mass; the trunk's: of its frame's origin."""
+    centres: Float[np.ndarray, "nbody 3 nv"]  #: of centres of mass; the trunk's: of its frame
     turns: Float[np.ndarray, "nbody 3 nv"]  #: rotational
     trunk_turns: Float[np.ndarray, "3 nv"]  #: the trunk's, about its principal axes
 

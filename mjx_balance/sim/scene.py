@@ -16,8 +16,7 @@ from mjx_balance.task.kinematics import joint_angles
 from mjx_balance.task.step import Targets
 
 ROBOT, BOARD = "robot/", "board/"
-CONTACT_TIME = 0.01
-"""Time constant of the foot contacts, s: near the shortest that 4 ms steps carry."""
+CONTACT_TIME = 0.01  #: of the foot contacts, s: near the shortest that 4 ms steps carry
 SETTLE_STEPS = 750
 SETTLE_ROUNDS = 4
 
@@ -49,8 +48,7 @@ class Layout:
     board_qpos: Int[np.ndarray, "2"]  #: of the board hinges, X and Y, in qpos
     board_ctrl: Int[np.ndarray, "2"]  #: of the board servos in ctrl
     trunk_quat: Int[np.ndarray, "4"]  #: of the trunk's orientation in qpos
-    trunk_velocity: Int[np.ndarray, "2"]
-    """Of the trunk's velocity along the world's x and y in qvel."""
+    trunk_velocity: Int[np.ndarray, "2"]  #: of its velocity along the world's x, y in qvel
     imu: Int[np.ndarray, "6"]  #: of gyro and accelerometer in sensordata
 
 
@@ -168,8 +166,7 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
 def _settle(layout: Layout) -> Stance:
     """Lets the robot come to rest on the level board with its joints at their targets.
 
-    A position servo under load stands off its target. Each round adds that error
-    to the trim, as the integral term of a servo would.
+    Each round adds the servos' error under load to the trim, as an integral term would.
     """
     model, legs, height = layout.model, layout.leg_qpos, layout.task.body_height
     servos, root = layout.leg_ctrl, layout.trunk_quat[0] - 3

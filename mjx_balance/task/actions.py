@@ -8,8 +8,7 @@ from mjx_balance.files.text import quote
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
-ACTIONS = ("discrete", "continuous")
-"""An index into `action_table`; or a_x and a_y as shares of `action_max`, -1 to 1."""
+ACTIONS = ("discrete", "continuous")  #: table index; shares of `action_max`, -1 to 1
 
 
 def check_action(kind: str) -> str:
@@ -36,16 +35,13 @@ def nearest_action(task: TaskConfig, change: Float[Array, "*batch 2"]) -> Int[Ar
 
 def leg_signs(robot: Robot) -> Float32[np.ndarray, "2 legs"]:
     """Which way each foot goes, +-1: left +a_x, right -a_x; front +a_y, hind -a_y."""
-    return np.where((robot.left, robot.front), np.float32(1), np.float32(-1))
+    return np.where((robot.each("left"), robot.each("front")), np.float32(1), np.float32(-1))
 
 
 def apply_action(
     robot: Robot, heights: Float[Array, "*batch legs"], change: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch legs"]:
-    """Adds an action to the commanded foot heights, m, within the legs' reach.
-
-    Raising the left side by a_x means longer left legs and shorter right ones.
-    """
+    """Adds an action to the commanded foot heights, m, within the legs' reach."""
     xp = heights.__array_namespace__()
     signs = leg_signs(robot).astype(heights.dtype)
     moved = heights + change[..., :1] * signs[0] + change[..., 1:] * signs[1]

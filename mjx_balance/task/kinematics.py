@@ -18,10 +18,7 @@ from mjx_balance.task import Array
 def joint_angles(
     robot: Robot, heights: Float[Array, "*batch legs"]
 ) -> Float[Array, "*batch legs 3"]:
-    """Inverse kinematics: foot heights, m, within `robot.height_range`, -> joint angles, rad.
-
-    The angles of a leg are abduction, hip and knee.
-    """
+    """Foot heights, m, in `robot.height_range` -> abduction, hip and knee angles, rad."""
     xp = heights.__array_namespace__()
     constant = functools.partial(np.asarray, dtype=heights.dtype)
     a, b = robot.each("thigh"), robot.each("calf")

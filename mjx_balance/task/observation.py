@@ -42,10 +42,8 @@ class Signals(NamedTuple):
     """Samples of all sensors up to a decision, the newest last."""
 
     heights: Float[Array, "*batch 1 legs"]  #: measured foot heights, m
-    commands: Float[Array, "*batch decisions legs"]
-    """Commanded foot heights, a sample per decision, m."""
-    imu: Float[Array, "*batch samples 6"]
-    """Gyro x, y, z and accelerometer x, y, z, a sample per physics step, rad/s and m/s^2."""
+    commands: Float[Array, "*batch decisions legs"]  #: commanded, a sample per decision, m
+    imu: Float[Array, "*batch samples 6"]  #: gyro, accelerometer, rad/s and m/s^2
 
 
 class Sensor(NamedTuple):
@@ -89,7 +87,7 @@ def _leg_rows(
 ) -> list[Row]:
     """A row per leg; `sign` is that of the partner leg in the mirror."""
     names = [name.format(leg=leg.name, lag=lag) for leg in robot.legs]
-    sides = list(zip(robot.left, robot.front, strict=True))
+    sides = [(leg.left, leg.front) for leg in robot.legs]
     mirrors = [Mirror(names[sides.index((not left, front))], sign) for left, front in sides]
     scale = float(np.float32(scale))
     return [

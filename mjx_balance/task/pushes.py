@@ -1,7 +1,4 @@
-"""Pushes: sudden changes of the trunk's velocity, in any horizontal direction.
-
-A push comes after a choice and before its decision: a controller sees its consequences alone.
-"""
+"""Pushes: sudden changes of the trunk's velocity in any horizontal direction, after a choice."""
 
 from typing import NamedTuple
 
@@ -15,8 +12,7 @@ from mjx_balance.task import Array
 class Pushes(NamedTuple):
     """The pushes of one env, or of a batch of them."""
 
-    velocity: Float[Array, "*batch pushes 2"]
-    """What each adds to the trunk's velocity along the world's x and y, m/s."""
+    velocity: Float[Array, "*batch pushes 2"]  #: along the world's x and y, m/s
     due: Int[Array, "*batch pushes"]  #: number of the decision that begins with it
 
 

@@ -44,8 +44,7 @@ class Targets(NamedTuple):
 class Motion(NamedTuple):
     """What an engine measures at every physics step of a decision; NaN where it has diverged."""
 
-    imu: Float[Array, "*batch sim_steps 6"]
-    """Gyro in rad/s and accelerometer in m/s^2, before each step."""
+    imu: Float[Array, "*batch sim_steps 6"]  #: gyro, accelerometer before each step
     tilt: Float[Array, "*batch sim_steps"]  #: body tilt after each step, deg
     joint_angles: Float[Array, "*batch sim_steps legs 3"]  #: after each step, rad
 
@@ -83,8 +82,7 @@ class Outcome(NamedTuple):
     rewards: dict[str, Float[Array, "*batch"]]  #: by name (`reward_terms`); their sum is the reward
     imu: Float[Array, "*batch sim_steps 6"]  #: IMU samples with noise, rad/s and m/s^2
     tilt: Float[Array, "*batch sim_steps"]  #: body tilt after each step, deg
-    terminated: Bool[Array, "*batch"]
-    """Whether the body tilted past `fail_tilt`, or the simulation diverged."""
+    terminated: Bool[Array, "*batch"]  #: the body fell, or the simulation diverged
     diverged: Bool[Array, "*batch"]  #: whether the simulation gave values that no robot can reach
 
     @property
@@ -101,10 +99,9 @@ def step(
     change: Float[Array, "*batch 2"],
     noise: Float[Array, "*batch sim_steps 6"] | None,
 ) -> tuple[EnvState, Outcome]:
-    """Takes one decision, in one env or in a batch.
+    """Takes one decision, in one env or in a batch; returns the state after it, and the outcome.
 
     `change` is a_x and a_y of the action, m; `noise` has a standard normal number per IMU sample.
-    Returns the state `ctrl_dt` later, and the outcome.
     """
     memory, targets = pre_step(task, robot, state, change)
     physics, params = state.physics, state.params

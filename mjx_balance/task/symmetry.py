@@ -13,17 +13,15 @@ from mjx_balance.task.observation import input_rows
 class Symmetries(NamedTuple):
     """The group of reflections, the identity first."""
 
-    obs_index: Int32[np.ndarray, "reflections obs_size"]
-    """Entry of the observation that takes each place."""
+    obs_index: Int32[np.ndarray, "reflections obs_size"]  #: entry that takes each place
     obs_sign: Float32[np.ndarray, "reflections obs_size"]  #: its sign there
     action_index: Int32[np.ndarray, "reflections actions"]  #: index that each action becomes
 
 
 def symmetries(task: TaskConfig, robot: Robot) -> Symmetries:
-    """The left-right mirror of the observation's rows and the actions of Eq. 3.
+    """The left-right mirror of the observation's rows and the actions; a_x changes its sign.
 
-    a_x changes its sign. The mirror is exact. Front-hind is no symmetry of the robot: all its
-    knees bend backward.
+    Front-hind is no symmetry of the robot: all its knees bend backward.
     """
     rows = input_rows(task, robot)
     place = {row.name: k for k, row in enumerate(rows)}

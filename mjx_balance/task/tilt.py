@@ -32,10 +32,8 @@ def board_angle(
 ) -> Float[Array, "*batch times 2"]:
     """Target angle of the board, deg, at times since the start, s, none of them negative.
 
-    Each axis moves at `rate` from the last target to the next and then rests;
-    it always arrives within the period (config checks that for the training, the
-    suites for theirs), so the angle is a closed form of the time. The board stays at the last
-    target.
+    Each axis moves at `rate` from the last target to the next and then rests; it always arrives
+    within the period (config and suites check that), so the angle is a closed form of the time.
     """
     targets, phase, rate = scenario
     xp = targets.__array_namespace__()

@@ -20,8 +20,7 @@ from mjx_balance.training.loop import Run
 from mjx_balance.training.validation import Results, best_validated, exports, scalars, score
 
 CHOICE_SCENARIOS = 32  #: scenarios per suite by which one of several seeds is chosen
-FINAL = "final"
-"""TensorBoard's name for the evaluation after training, which has the validations' tags."""
+FINAL = "final"  #: TensorBoard's folder of the evaluation after training
 
 
 def check_fits(config: Config) -> None:
@@ -80,10 +79,7 @@ def _hand_out(folder: RunFolder, policy: Policy) -> None:
 
 
 def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
-    """Evaluates every seed, makes the best one the run's policy, draws and sums up.
-
-    `evaluation.json`, which marks a finished run, is written last.
-    """
+    """Evaluates all seeds, makes the best the run's policy, and writes evaluation.json last."""
     config, folder, console = run.config, run.folder, run.display.console
     each = [_evaluate(run, policy, config.eval_scenarios, SEEDS.final) for policy in policies]
     best = _choose(run, policies, each) if run.num_seeds > 1 else 0

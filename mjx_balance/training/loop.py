@@ -41,8 +41,7 @@ STOPPING = (
 
 Program = Callable[[TrainState], tuple[TrainState, Mapping[str, jax.Array]]]
 """A compiled call: many decisions of every env, and the means of its metrics."""
-Validate = Callable[[TrainState], Mapping[str, np.ndarray]]
-"""Validates the greedy policies of a state: logged name -> one value per seed."""
+Validate = Callable[[TrainState], Mapping[str, np.ndarray]]  #: by logged name, a value per seed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,11 +97,7 @@ class Interrupts:
             signal.signal(number, handler)
 
     def run(self, call: Callable[..., T], *arguments: Any) -> T:
-        """Runs a call that may take a minute, and answers an interrupt meanwhile.
-
-        The call has a thread of its own: Python handles no signal while the main thread is in a
-        compiled program.
-        """
+        """Runs a call in a thread: while compiled code runs in it, Python handles no signal."""
         future: Future[T] = Future()
 
         def work() -> None:

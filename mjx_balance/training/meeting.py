@@ -18,8 +18,7 @@ from typing import Any
 from mjx_balance.errors import FAILED, InputError
 from mjx_balance.files.text import MESSAGE, shorten
 
-PROGRAM = "mjx_balance"
-"""What a process of ours says first, within `HELLO_S`; whoever does not is a stranger."""
+PROGRAM = "mjx_balance"  #: what a process of ours says first, within `HELLO_S`
 HELLO_S, LINE_BYTES, THREADS = 5, 2**16, 100
 """Longest line that is read; from so many threads on, connections wait to be asked."""
 KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 4, "TCP_USER_TIMEOUT": 30_000}

@@ -22,8 +22,7 @@ from mjx_balance.training.meeting import ProcessError, Watch, host, listen, visi
 
 T = TypeVar("T")
 
-PATIENCE_S = 300
-"""Time in which all processes must come, s: as long as `jax.distributed` gives them."""
+PATIENCE_S = 300  #: in which all processes must come, s, as in `jax.distributed`
 
 
 class Interrupted(Exception):
@@ -108,10 +107,7 @@ class Processes:
         return any(self.gather(flag))
 
     def run_on_all(self, function: Callable[[], T], *errors: type[Exception]) -> T:
-        """Returns what a function returns here, once it has returned in all processes.
-
-        If it raises one of `errors` in one of them, all raise it, with the message of the first.
-        """
+        """Calls a function in all processes; if it raises one of `errors` in one, all raise it."""
         value, failure, own = None, None, None
         try:
             value = function()
@@ -126,10 +122,7 @@ class Processes:
         return cast(T, value)
 
     def broadcast(self, function: Callable[[], T], *errors: type[Exception]) -> T:
-        """Returns in all processes the JSON value that a function returns in the first alone.
-
-        If it raises one of `errors`, all processes raise it.
-        """
+        """Returns in all processes what a function returns in the first; all raise its `errors`."""
         value = self.run_on_all(lambda: function() if self.first else None, *errors)
         return cast(T, self.gather(value)[0])
 

@@ -26,8 +26,7 @@ MEANING = {
     "other": "the rest of the device's program",
     "host": "the device waits for its next operation",
 }
-SCOPES = ("physics", "env", "acting", "replay", "updates")
-"""`jax.named_scope`s of env and learner; the innermost of them counts."""
+SCOPES = ("physics", "env", "acting", "replay", "updates")  #: `jax.named_scope`s
 EXCHANGES = ("psum", "pmin", "pmax", "all_gather")  #: what devices wait for each other in
 SKIPPED = 3  #: calls before the one that is traced: until then there are no updates yet
 TOO_SHORT = (
@@ -52,8 +51,7 @@ class Event(NamedTuple):
 class Profiled:
     """A program, one of whose calls is traced."""
 
-    program: CompiledProgram
-    """Compiled without a cache, which would not keep the names of its parts."""
+    program: CompiledProgram  #: compiled without a cache, which keeps no names
     folder: Path  #: for the trace and its `shares.json`
     log_fn: Callable[[str], None]
     calls: int = 0

@@ -8,7 +8,6 @@ is traced from. Both caches are optional: what is damaged or cannot be written i
 import contextlib
 import dataclasses
 import hashlib
-import importlib.metadata
 import os
 import tempfile
 import warnings
@@ -24,6 +23,7 @@ from mjx_balance.config import Config, to_dict
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.files.sources import code
 from mjx_balance.machine import cores
+from mjx_balance.policy.manifest import installed_version
 from mjx_balance.robots.catalogue import robot_xml
 from mjx_balance.sim.engines import ffi
 from mjx_balance.sim.scene import scene_dir
@@ -68,10 +68,7 @@ def enable_compilation_cache(log_fn: LogFn) -> None:
 
 @contextlib.contextmanager
 def mending_xla_cache(log_fn: LogFn) -> Iterator[None]:
-    """Compile in here: entries that XLA finds damaged are logged and removed.
-
-    XLA compiles such a program again, but neither uses nor replaces the file.
-    """
+    """Compile in here: entries that XLA finds damaged, but would leave, are logged and removed."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.filterwarnings("always", message=XLA_DAMAGED)
         yield
@@ -89,11 +86,7 @@ def mending_xla_cache(log_fn: LogFn) -> Iterator[None]:
 
 def versions() -> dict[str, str | None]:
     """Installed versions of `LIBRARIES`."""
-    installed: dict[str, str | None] = dict.fromkeys(LIBRARIES)
-    for name in LIBRARIES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            installed[name] = importlib.metadata.version(name)
-    return installed
+    return {name: installed_version(name) for name in LIBRARIES}
 
 
 def program_key(config: Config, iterations: int, root: str) -> str:

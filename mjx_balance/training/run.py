@@ -9,23 +9,12 @@ from typing import Any
 
 import jax
 
-from mjx_balance.config import (
-    Config,
-    ConfigError,
-    check_same_config,
-    flatten,
-    read_run_config,
-    to_dict,
-)
+from mjx_balance.config import Config, ConfigError, flatten, to_dict
+from mjx_balance.config.serialization import check_same_config, read_run_config
 from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.files.run_folder import (
-    RunFolder,
-    RunFolderError,
-    check_same_provenance,
-    create_run_folder,
-    locked,
-)
+from mjx_balance.files import run_folder
+from mjx_balance.files.run_folder import RunFolder, RunFolderError
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report.progress import Display
 from mjx_balance.sim.engines.table import ENGINES
@@ -45,24 +34,13 @@ def train(
 ) -> finish.Results | None:
     """Runs or continues a training and everything that follows it.
 
-    Args:
-      config: to train; must equal that of the folder to continue.
-      run_dir: folder to create; one named after preset, seed and time if None.
-      resume: folder to continue instead.
-      display: shows progress.
-      cluster: place of this process among several; the first one writes, shows and evaluates.
-      profile: whether to trace a call of the training program and sum it up.
+    A new run has the folder `run_dir`, or one named after preset, seed and time; `resume` is the
+    folder of a run to continue, with the same config. Of several processes (`cluster`) the first
+    one writes, shows and evaluates. `profile` traces a call of the training program and sums it up.
 
-    Returns:
-      The evaluation, suite name -> JSON of `rollout.summarize`; None in the other processes.
-
-    Raises:
-      ConfigError: for an impossible config, or an evaluation that would not fit into the memory.
-      RunFolderError: for a folder that cannot be used.
-      CheckpointError: for a folder whose checkpoints are damaged.
-      PolicyError: if no seed learnt a policy of finite numbers.
-      ProcessError: if the processes do not come together or do not fit together.
-      Interrupted: if the user stopped the run.
+    Returns the evaluation, suite name -> JSON of `rollout.summarize`; None in the other processes.
+    Raises `ConfigError`, `RunFolderError`, `CheckpointError` or `ProcessError` for what cannot be
+    used, `PolicyError` if no seed learnt finite numbers, `Interrupted` if the user stopped the run.
     """
     start_time = time.perf_counter()
     with joined(cluster) as processes:
@@ -120,11 +98,11 @@ def _open_folder(
     """Creates the folder of a new run, or checks that of the run to continue."""
     if resume is not None:
         check_same_config(read_run_config(resume), config, resume)
-        if warning := check_same_provenance(resume, today):
+        if warning := run_folder.check_same_provenance(resume, today):
             display.say(warning)
         return resume
     name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder = create_run_folder(run_dir or Path("runs") / name, to_dict(config), today)
+    folder = run_folder.create_run_folder(run_dir or Path("runs") / name, to_dict(config), today)
     return folder.path.absolute()
 
 
@@ -150,7 +128,9 @@ def _announce(run: Run) -> None:
 def _locked(run: Run) -> Iterator[None]:
     """The lock of a run's folder, held by the first process; an interrupt becomes a sentence."""
     with contextlib.ExitStack() as stack:
-        run.processes.broadcast(lambda: stack.enter_context(locked(run.folder)), RunFolderError)
+        run.processes.broadcast(
+            lambda: stack.enter_context(run_folder.locked(run.folder)), RunFolderError
+        )
         try:
             yield
         except KeyboardInterrupt as error:  # the folder is whole anyway

@@ -22,13 +22,10 @@ from mjx_balance.sim.engines.table import check_platform
 from mjx_balance.training.program_cache import LogFn, cache_dir, enable_compilation_cache
 
 SIZES_FILE = "sizes.json"  #: in the cache: numbers of envs by device and engine, as measured
-NEAR_BEST = 0.9
-"""Share of the best rate from which on more envs are not worth their memory and their batches."""
+NEAR_BEST = 0.9  #: share of the best rate from which on more envs are not worth it
 STATE_COPIES = 2  #: a checkpoint is read back beside the state that it replaces
-ENV_BYTES = 40_000
-"""Of each env while MJX steps it: twice what XLA plans for on a CPU, which fuses more."""
-PROGRAM_BYTES = 1.3 * 2**30
-"""Memory of a run besides: libraries, compiler, program (benchmarks/README.md)."""
+ENV_BYTES = 40_000  #: per env while MJX steps it: twice XLA's plan on a CPU, which fuses more
+PROGRAM_BYTES = 1.3 * 2**30  #: libraries, compiler, program (benchmarks/README.md)
 CPU_ENVS = 256  #: what the sizes of presets without `num_envs` are meant for
 ACCELERATOR_ENVS = 2_048  #: of an accelerator that has not been measured
 COUNTED_IN_ENVS = ("num_env_steps", "log_every", "eval_every")

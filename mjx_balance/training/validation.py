@@ -1,7 +1,4 @@
-"""Validation during training: the greedy policy of every seed on held-out scenarios.
-
-The file of a validated policy holds its result; the choice of the best reads only these files.
-"""
+"""Validation during training: the greedy policy of every seed on held-out scenarios."""
 
 import time
 from collections.abc import Callable, Iterator

@@ -470,7 +470,7 @@ def test_a_trunk_whose_origin_is_behind_all_legs(tmp_path: Path, robot: Robot) -
         (f'"{leg}_hip" pos="{old}', f'"{leg}_hip" pos="{x}') for leg, (old, x) in shifts.items()
     ]
     other = find_robot(bodies.write_robot(tmp_path, edits))
-    assert (other.left, other.front) == (robot.left, robot.front)
+    assert [(x.left, x.front) for x in other.legs] == [(x.left, x.front) for x in robot.legs]
     assert other.lever == pytest.approx(0.193)
     assert other.action_max == 0.003
     assert other.each("x") == pytest.approx([0.396, 0.396, 0.01, 0.01])

@@ -71,7 +71,7 @@ def test_left_right_by_name(any_config: Config, robot: Robot) -> None:
 def test_legs_in_another_order_have_the_same_partners(any_config: Config, robot: Robot) -> None:
     """FR RL FL RR: sides count, not letters."""
     other = dataclasses.replace(robot, legs=tuple(robot.legs[k] for k in (1, 2, 0, 3)))
-    assert other.left == (False, True, True, False)
+    assert [leg.left for leg in other.legs] == [False, True, True, False]
     group = symmetries(any_config.task, other)
     assert group.obs_index[1][:4].tolist() == [2, 3, 0, 1]
     change = np.asarray((0.001, 0.002))

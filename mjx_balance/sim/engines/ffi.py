@@ -14,8 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-METADATA = 1
-"""`XLA_FFI_Extension_Metadata`: the call asks for the version that the handler was made for."""
+METADATA = 1  #: `XLA_FFI_Extension_Metadata`: the call asks for the handler's version
 INTERNAL = 13  #: `XLA_FFI_Error_Code_INTERNAL`
 FLOAT32 = 11  #: `XLA_FFI_DataType_F32`
 
@@ -72,8 +71,7 @@ _Frame = _struct(
 )
 _HANDLER = ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
 
-_TARGETS: dict[str, tuple[Any, Any]] = {}
-"""Handlers and capsules, kept alive for as long as a program may call them."""
+_TARGETS: dict[str, tuple[Any, Any]] = {}  #: handlers and capsules, kept alive
 
 HostFunction = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
 """(arguments, results to be written), float32 arrays; they are gone once it returns."""

@@ -14,10 +14,7 @@ from mjx_balance.task.step import Motion, Targets
 
 
 class PhysicsState(NamedTuple):
-    """State of one env between physics steps.
-
-    Holds only what a physics step reads, so that it is cheap to carry, to reset and to save.
-    """
+    """What a physics step of one env reads: cheap to carry, to reset and to save."""
 
     qpos: Float[jax.Array, " nq"]
     qvel: Float[jax.Array, " nv"]

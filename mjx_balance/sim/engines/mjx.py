@@ -34,10 +34,7 @@ def physics_step(
     state: PhysicsState,
     ctrl: Float[jax.Array, " nu"],
 ) -> tuple[PhysicsState, Motion, mjx.Data]:
-    """One physics step of one env, whose state is put into `blank` data.
-
-    Returns the state after it, the motion (without the axis of steps), and all of MJX's data.
-    """
+    """Steps one env in `blank` data; returns its state, its motion and all of MJX's data."""
     data = blank.replace(**state._asdict(), ctrl=ctrl)
     # TF32 matrix products, the default on recent GPUs, are too coarse for contacts.
     with jax.default_matmul_precision("highest"):

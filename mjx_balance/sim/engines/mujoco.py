@@ -1,7 +1,4 @@
-"""MuJoCo's C engine: advances many envs by one decision, on all cores. No JAX.
-
-Runs as MuJoCo ships it: float64, default solver accuracy.
-"""
+"""MuJoCo's C engine as it ships: many envs, on all cores, in float64. No JAX."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,16 +15,12 @@ Ids = Int[np.ndarray, " n"]  #: envs of a batch
 
 
 class MujocoEngine:
-    """`task.step.Engine` over a batch of envs of one scene, whose states it owns.
-
-    Its `physics` are ids of envs.
-    """
+    """`task.step.Engine` over a batch of envs, whose states it owns; `physics` are their ids."""
 
     def __init__(self, scene: Scene, count: int, threads: int | None = None):
         """Puts `count` robots into the settled stance; `threads` None: all cores."""
         self.scene = scene
-        self.recorded: dict[str, np.ndarray] = {}
-        """`RECORDED` fields (n, sim_steps, ...) of the last decision."""
+        self.recorded: dict[str, np.ndarray] = {}  #: (n, sim_steps, ...) of the last decision
         self._batch = Batch(scene.model, count, threads or cores())
         self._params = np.full((count, 6), np.nan)
         self.reset(np.arange(count))

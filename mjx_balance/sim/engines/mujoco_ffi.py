@@ -80,10 +80,7 @@ class _Pool:
 
     @contextmanager
     def _borrowed(self, count: int, params: DomainParams | None) -> Iterator[MujocoEngine]:
-        """An engine of that many envs that nobody else uses.
-
-        The one whose models differ least from these parameters: that of the same device.
-        """
+        """A free engine of that many envs, whose models differ least from these parameters."""
         everyone = np.arange(count)
         with self._lock:
             free = self._free[count, params is None]

@@ -27,8 +27,7 @@ class EngineRow(NamedTuple):
     """One engine, and what the rest of the package needs to know of it."""
 
     name: str  #: as in `Config.engine`
-    make: str
-    """`MODULE:FUNCTION` of this folder, (scene, options) -> `JaxEngine`; imported when called."""
+    make: str  #: `MODULE:FUNCTION` of this folder, imported when called
     platforms: tuple[str, ...] = ()  #: JAX platforms that it runs on; none named: all
     hardware: str = "every device"  #: the same in words
     cacheable: bool = True  #: whether its traced programs work in another process

@@ -25,8 +25,7 @@ from mjx_balance.task.step import Motion
 
 T = TypeVar("T")
 
-UNCONVERGED = 1 << 9 | 1 << 10
-"""Bits of `Data.overflow` that are no overflow: the limits on the solver's iterations."""
+UNCONVERGED = 1 << 9 | 1 << 10  #: bits of `Data.overflow` for the solver's iterations
 
 
 class WarpOverflowError(RuntimeError):
@@ -34,10 +33,7 @@ class WarpOverflowError(RuntimeError):
 
 
 def contact_room(model: mujoco.MjModel) -> tuple[int, int]:
-    """The most contacts that one env can have, and the most constraint rows.
-
-    MJX's own count, which is static: all contacts of all pairs, touching or not.
-    """
+    """The most contacts, touching or not, and constraint rows of one env, as MJX counts them."""
     static = mjx.make_data(model)._impl
     return len(static.contact.dist), int(static.nefc)
 
