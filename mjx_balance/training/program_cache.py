@@ -26,6 +26,7 @@ from mjx_balance.machine import cores
 from mjx_balance.policy.manifest import installed_version
 from mjx_balance.robots.catalogue import robot_xml
 from mjx_balance.sim.engines import ffi
+from mjx_balance.sim.engines.table import ENGINES
 from mjx_balance.sim.scene import scene_dir
 
 LIBRARIES = ("mjx_balance", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax")
@@ -89,6 +90,12 @@ def versions() -> dict[str, str | None]:
     return {name: installed_version(name) for name in LIBRARIES}
 
 
+def traced_code(config: Config, root: str) -> list[tuple[str, str]]:
+    """Modules and code of `root`, of the config's engine, and of all that they import."""
+    module = ENGINES[config.engine].make.partition(":")[0]
+    return sorted((code(root) | code(f"mjx_balance.sim.engines.{module}")).items())
+
+
 def program_key(config: Config, iterations: int, root: str) -> str:
     """Fingerprint of a training program: equal for equal programs, whatever is around them.
 
@@ -97,7 +104,7 @@ def program_key(config: Config, iterations: int, root: str) -> str:
     values = {k: v for k, v in to_dict(config).items() if k not in NOT_TRACED}
     devices = [(device.platform, device.device_kind) for device in jax.devices()]
     flags = [str(getattr(jax.config, name)) for name in FLAGS]
-    traced = (values, iterations, devices, cores(), flags, versions(), sorted(code(root).items()))
+    traced = (values, iterations, devices, cores(), flags, versions(), traced_code(config, root))
     key = hashlib.sha256(repr(traced).encode())
     for path in sorted(scene_dir().glob("*.xml")):
         key.update(path.name.encode() + b"\0" + path.read_bytes())

@@ -15,7 +15,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from mjx_balance.config import Config, preset
 from mjx_balance.files.sources import code
 from mjx_balance.training import program_cache, sizing
-from mjx_balance.training.program_cache import NOT_TRACED, compile_program, program_key
+from mjx_balance.training.program_cache import NOT_TRACED, compile_program, program_key, traced_code
 
 ROOT = sizing.__name__
 CONFIG = preset("smoke")
@@ -181,7 +181,7 @@ def test_the_key_depends_on_every_number_that_is_traced() -> None:
             value = getattr(section, field.name)
             if field.name in NOT_TRACED or dataclasses.is_dataclass(value):
                 continue
-            other = "go1" if field.name == "robot" else f"{value} and more"
+            other = {"robot": "go1", "engine": "mujoco"}.get(field.name, f"{value} and more")
             changed = dataclasses.replace(section, **{field.name: other})
             keys.add(key(dataclasses.replace(CONFIG, **{name: changed}) if name else changed))
             count += 1
@@ -241,10 +241,12 @@ def test_a_library_and_a_device_change_the_key(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_code_that_is_traced_is_found_and_no_other() -> None:
-    found = {name.removeprefix("mjx_balance.") for name in code(ROOT)}
+    found = {name.removeprefix("mjx_balance.") for name, _ in traced_code(CONFIG, ROOT)}
     traced = "envs.balance sim.engines.mjx sim.scene config task.reward task.step"
     traced += " training.sizing dqn.dqn dqn.networks dqn.normalization dqn.mesh dqn.replay"
     assert set(traced.split()) <= found
+    other = dict(traced_code(dataclasses.replace(CONFIG, engine="mujoco"), ROOT))
+    assert "mjx_balance.sim.engines.mujoco_ffi" in other
     others = "cli evaluation render report report.progress training.finish training.loop"
     assert not found & set(others.split())
     assert not [name for name in found if name.startswith("report")]
