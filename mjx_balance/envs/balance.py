@@ -1,14 +1,13 @@
 """`BalanceEnv`: one robot on one board, a brax environment with 441 or with continuous actions."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
 from mjx_balance.config import ACTION_AXES, Config, check, preset
-from mjx_balance.envs.metrics import Metric
 from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.actions import action_table, check_action
@@ -19,6 +18,15 @@ from mjx_balance.task.reward import reward_rows
 from mjx_balance.task.step import EnvState, initial_memory, observation, step
 from mjx_balance.task.symmetry import Symmetries, symmetries
 from mjx_balance.task.tilt import draw_scenario
+
+
+class Metric(NamedTuple):
+    """A row of an env's table `metrics`: how a metric's mean is logged, if not as it is."""
+
+    name: str | None = None  #: logged name; None: its own
+    per: Literal["decision", "minute", "call"] = "decision"
+    """A mean over decisions, a rate per minute of one env, or a sum over a call's decisions."""
+    per_seed: bool = False  #: whether it is also logged for every seed, if there are several
 
 
 class BalanceEnv(Env):

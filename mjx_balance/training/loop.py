@@ -18,8 +18,7 @@ from tensorboardX import SummaryWriter
 
 from mjx_balance.config import Config, expand_runs
 from mjx_balance.dqn import DQN, TrainState
-from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.envs.metrics import Metric
+from mjx_balance.envs.balance import BalanceEnv, Metric
 from mjx_balance.files.run_folder import RunFolder, keep_metrics_until, keep_validated_until
 from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints
@@ -97,7 +96,7 @@ class Interrupts:
             signal.signal(number, handler)
 
     def run(self, call: Callable[..., T], *arguments: Any) -> T:
-        """Runs a call in a thread: while compiled code runs in it, Python handles no signal."""
+        """Runs a call in a thread, to answer interrupts while it is in compiled code."""
         future: Future[T] = Future()
 
         def work() -> None:
