@@ -79,11 +79,7 @@ HELD_OUT = {f"eval/{suite}/tilt_mean": f"held out, {suite}" for suite in HEADLIN
 
 @styled
 def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
-    """Tilt, falls, reward, loss, epsilon and speed of runs, lines of metrics.jsonl, over env steps.
-
-    A line shows the median over runs and seeds, a band the extremes. Each point in the tilt panel
-    is one validation of one seed.
-    """
+    """Tilt, falls, reward, loss, epsilon and speed over env steps: median and extremes of runs."""
     figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
     longest = max(runs, key=lambda run: run[-1]["env_steps"])
     steps = np.asarray([m["env_steps"] for m in longest])

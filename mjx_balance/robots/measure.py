@@ -260,11 +260,7 @@ def _level_turns(leg: LegFile, turns: Range) -> float:
 def _bend(
     leg: LegFile, hip: Range, knee: Range, lengths: list[float]
 ) -> tuple[Range, float, float]:
-    """Chooses which way the knee points; returns as `_bend_to`.
-
-    It points backward unless the file says otherwise or forward has more than twice the range: the
-    legs should bend alike even if their limits differ slightly.
-    """
+    """The knee's way: the file's, or backward unless forward has more than twice the range."""
     backward, forward = (_bend_to(side, hip, knee, lengths) for side in (-1, 1))
     if leg.knee is not None:
         bend = forward if leg.knee == "forward" else backward
