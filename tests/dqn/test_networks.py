@@ -30,8 +30,10 @@ def test_value_of_an_action_is_the_sum_of_its_levels(factors: tuple[int, ...]) -
     """An action's index is a mixed-radix number; the joint head gives the levels' own values."""
     obs = random_obs(10, 34)
     params = random_params(QNetwork((16,), factors))
-    values = np.asarray(QNetwork((16,), factors).apply(params, obs))
-    levels = np.asarray(QNetwork((16,), (sum(factors),)).apply(params, obs))
+    values, levels = (
+        np.asarray(jax.jit(QNetwork((16,), shape).apply)(params, obs))
+        for shape in (factors, (sum(factors),))
+    )
     branches = np.split(levels, np.cumsum(factors)[:-1], axis=-1)
     for row in range(10):
         sums = functools.reduce(np.add.outer, [branch[row] for branch in branches])
@@ -78,7 +80,7 @@ def in_jax(head: heads.Head) -> heads.Head:
     return heads.Radial(out, profile, stretch, head.factors)
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("batch", [(), (2, 3)])
 def test_heads_give_numpy_and_jax_the_same(batch: tuple[int, ...]) -> None:
     rng = np.random.default_rng(4)
     action = rng.integers(24, size=batch)

@@ -14,7 +14,7 @@ FLOOR = 1e-6
 def statistics_of(batches: list[np.ndarray]) -> normalization.RunningStatistics:
     """Statistics of batches, each split in halves on two devices."""
     statistics = normalization.init(batches[0].shape[1], FLOOR)
-    observe = jax.vmap(normalization.observe, (None, 0, None), axis_name=AXIS)
+    observe = jax.jit(jax.vmap(normalization.observe, (None, 0, None), axis_name=AXIS))
     for batch in batches:
         halves = jnp.asarray(np.split(batch, 2), jnp.float32)
         statistics = jax.tree.map(lambda x: x[0], observe(statistics, halves, FLOOR))
@@ -77,7 +77,7 @@ def test_folded_parameters_take_raw_observations(radial: bool, hidden: tuple[int
     shapes = jax.eval_shape(network.init, jax.random.PRNGKey(0), jnp.zeros(5))
     params = jax.tree.map(lambda x: normal(*x.shape), shapes)
     mean, matrix, obs = normal(5), normal(5, 5), normal(20, 5)
-    expected = np.asarray(network.apply(params, (obs - mean) @ matrix))
+    expected = np.asarray(jax.jit(network.apply)(params, (obs - mean) @ matrix))
     folded = network.fold_whitening(params, mean, matrix)
-    got = np.asarray(network.apply(folded, obs))
+    got = np.asarray(jax.jit(network.apply)(folded, obs))
     np.testing.assert_allclose(got, expected, rtol=2e-4, atol=2e-4)
