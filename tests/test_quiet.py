@@ -7,6 +7,7 @@ import types
 import pytest
 
 from mjx_balance.quiet import quiet_imports
+from mjx_balance.sim.engines.table import unused_modules
 
 
 def test_pytorch_is_not_there_while_others_are_imported(
@@ -19,6 +20,10 @@ def test_pytorch_is_not_there_while_others_are_imported(
             importlib.import_module("torch")
     assert "torch" not in sys.modules
     assert capsys.readouterr().out == ""
+
+
+def test_only_the_engine_that_runs_brings_its_library() -> None:
+    assert [unused_modules(name) for name in ("mjx", "mujoco", "warp")] == [["warp"], ["warp"], []]
 
 
 def test_pytorch_that_is_in_use_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,9 +104,10 @@ def test_flags_start_from_the_preset_or_from_the_resumed_run(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     given: list[Any] = []
-    monkeypatch.setattr(run, "train", lambda *arguments: given.append(arguments[:3]))
+    monkeypatch.setattr(run, "train", lambda *arguments: given.append(arguments))
     assert main(["train", "--preset", "smoke", "--gamma", "0.7", "--run-dir", "a"]) == 0
-    config, run_dir, resume = given[0]
+    config, run_dir, resume, display, *others = given[0]
+    assert (display.console.quiet, others) == (False, [None, False])
     assert (config.preset, config.num_envs, config.dqn.gamma) == ("smoke", 64, 0.7)
     assert (run_dir, resume) == (Path("a"), None)
     assert main(["train"]) == 0
@@ -114,7 +115,39 @@ def test_flags_start_from_the_preset_or_from_the_resumed_run(
     saved = dataclasses.replace(preset("best"), seed=9, num_env_steps=77)
     create_run_folder(tmp_path / "run", to_dict(saved), {})
     assert main(["train", "--resume", "run"]) == 0
-    assert given[2] == (saved, None, Path("run"))
+    assert given[2][:3] == (saved, None, Path("run"))
+
+
+def test_a_process_among_several_is_quiet_but_for_the_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr(run, "train", lambda *arguments: given.append(arguments[3:]))
+    where = "--coordinator localhost:7 --num-processes 3 --process-id"
+    for index in (0, 2):
+        assert main(["train", "--profile", *where.split(), str(index)]) == 0
+    (first, *one), (other, *two) = given
+    assert one == [("localhost:7", 3, 0, None), True]
+    assert two == [("localhost:7", 3, 2, None), True]
+    assert (first.console.quiet, other.console.quiet) == (False, True)
+
+
+def test_a_report_is_of_what_was_asked_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """64 scenarios into the first folder, or what the flags say; what is missing is said."""
+    asked: list[Any] = []
+    monkeypatch.setattr(
+        "mjx_balance.report.page.write_report",
+        lambda *given: asked.append(given[:3]) or ["no video"],
+    )
+    assert main(["report", "a", "b"]) == 0
+    assert main("report a --out page.html --scenarios 5".split()) == 0
+    a, b = Path("a"), Path("b")
+    assert asked == [((a, b), a / "report.html", 64), ((a,), Path("page.html"), 5)]
+    said = capsys.readouterr()
+    assert said.out.split() == ["a/report.html", "page.html"]
+    assert said.err == 2 * "mjx-balance: no video\n"
 
 
 SMOKE = dataclasses.replace(preset("smoke"), num_devices=1)

@@ -118,6 +118,8 @@ def test_what_does_not_hold_is_said(spot: tuple[Scene, TiltTest]) -> None:
         "and 6 is a fall"
     ]
     share = np.zeros((4, 3))
+    share[2, 1] = 0.985
+    assert problems(scene, got._replace(torque_share=share, tilt=6.0)) == []
     share[2, 1] = 0.995
     spent = problems(scene, got._replace(torque_share=share))
     assert len(spent) == 1

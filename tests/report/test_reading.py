@@ -216,6 +216,7 @@ def test_of_long_metrics_the_beginning_is_read(
     monkeypatch: pytest.MonkeyPatch, metrics_line: Any, read: Any
 ) -> None:
     lines = [metrics_line(k, 1) for k in range(4)]
+    assert 10_000 * len(json.dumps(lines[0])) < reading.METRICS_BYTES, "no run logs so much"
     monkeypatch.setattr(reading, "METRICS_BYTES", len("\n".join(map(json.dumps, lines[:3]))) - 1)
     run = read(lines)
     assert [line["env_steps"] for line in run.metrics] == [1024, 2048], "the third is cut off"

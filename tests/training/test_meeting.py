@@ -205,6 +205,15 @@ def test_a_lost_process_ends_all_with_a_sentence(
     assert capfd.readouterr().err.splitlines() == [sentence] * 2
 
 
+def test_a_silent_machine_counts_as_gone_after_half_a_minute() -> None:
+    """Probes after 10 s, four of them 5 s apart; what is sent meanwhile, by milliseconds."""
+    idle, interval, count, timeout_ms = (
+        meeting.KEEP_ALIVE[f"TCP_{name}"]
+        for name in ("KEEPIDLE", "KEEPINTVL", "KEEPCNT", "USER_TIMEOUT")
+    )
+    assert idle + interval * count == timeout_ms / 1000 == 30
+
+
 def test_processes_may_leave_once_the_run_has_ended(pairs: Any, exits: list[int]) -> None:
     (to_1, at_1), _ = pairs
     watch = Watch({1: to_1})
