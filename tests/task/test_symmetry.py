@@ -81,14 +81,9 @@ def test_legs_in_another_order_have_the_same_partners(any_config: Config, robot:
 
 def loaded(side: float) -> DomainParams:
     """A load on the left or right shoulder, weak servos, delayed actions: (n,) = (2,)."""
-    return DomainParams(
-        imu_noise=np.zeros((2, 6)),
-        payload=np.asarray((3.0, 0.0)),
-        payload_at=np.tile((0.04, 0.05 * side, 0.08), (2, 1)),
-        friction=np.full(2, 0.7),
-        gain=np.asarray((0.9, 1.0)),
-        delay=np.asarray((0.0, 1.0)),
-    )
+    load, at = np.asarray((3.0, 0.0)), np.tile((0.04, 0.05 * side, 0.08), (2, 1))
+    friction, gain, delay = np.full(2, 0.7), np.asarray((0.9, 1.0)), np.asarray((0.0, 1.0))
+    return DomainParams(np.zeros((2, 6)), load, at, friction, gain, delay)
 
 
 def test_the_robot_on_a_mirrored_board_sees_the_mirrored_world(
