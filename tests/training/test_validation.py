@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -52,7 +53,11 @@ def test_what_is_logged_has_a_name_for_each_suite_and_statistic() -> None:
 
 
 def test_every_seed_is_validated_as_its_exported_policy_is_evaluated(
-    scene: Scene, folder: RunFolder, stub_learner: Any, make_run: Any
+    scene: Scene,
+    folder: RunFolder,
+    stub_learner: Any,
+    make_run: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """And the file of the policy holds its result; a seed that diverged has none.
 
@@ -61,6 +66,7 @@ def test_every_seed_is_validated_as_its_exported_policy_is_evaluated(
     run = make_run(dataclasses.replace(SHORT, num_seeds=3), scene)
     state = stub_learner.state_of(1.0, np.nan, -3.0, env_steps=128)
     before = jax.tree.map(np.array, state), random.getstate(), str(np.random.get_state())
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # its checks draw names
     found = validate(run, state)
     jax.tree.map(np.testing.assert_array_equal, state, before[0])
     assert (random.getstate(), str(np.random.get_state())) == before[1:]
