@@ -81,8 +81,12 @@ class Controller:
     ) -> None:
         """Reads a policy file; the state is then STANDING.
 
-        `clock` returns the current time, s; in simulation, pass the simulation's. Raises
-        `PolicyFileError` if the file is missing, damaged, or not a policy that this file can run.
+        Args:
+          path: of the policy file.
+          clock: returns the current time, s; in simulation, pass the simulation's.
+
+        Raises:
+          PolicyFileError: if the file is missing, damaged, or not a policy that this file can run.
         """
         path = Path(path)
         try:

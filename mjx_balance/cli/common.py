@@ -25,7 +25,11 @@ def complain(message: str, code: int = USAGE_ERROR) -> int:
 
 
 def check_out(name: str, path: Path | None, suffix: str = "") -> None:
-    """Raises `InputError` before the work begins if the file of flag `name` cannot be written."""
+    """Checks before the work begins that the output file of flag `name` can be written.
+
+    Raises:
+      InputError: if the suffix differs, the path is a folder, or its folder does not exist.
+    """
     if path is None:
         return
     if suffix and path.suffix != suffix:
@@ -48,7 +52,11 @@ class ControllerArgs:
     """Robot of the baseline, or the new path of the policy's robot file."""
 
     def load(self) -> tuple[Scene, Controller]:
-        """Loads the policy or baseline, and its scene; raises `InputError` unless one is given."""
+        """Loads the policy or builds the baseline, and its scene.
+
+        Raises:
+          InputError: if both or neither are given, or the policy or robot cannot be used.
+        """
         if (self.policy is None) == (self.controller is None):
             raise ControllerError("name a policy file or --controller NAME, one of the two")
         if self.policy is not None:

@@ -63,7 +63,13 @@ class Session:
     def __init__(
         self, scene: Scene, controller: Controller, suite: str | None = None, seed: int = 0
     ):
-        """Stands the robot on the board; raises `SuiteError` for an unknown suite or a bad seed."""
+        """Stands the robot on the level board, which keys move if there is no suite.
+
+        `seed` draws pushes by key and the first scenario of the suite; each later one adds 1.
+
+        Raises:
+          SuiteError: if the suite does not exist, or the seed is negative.
+        """
         check_seed(seed)
         self.scene, self.task, self.controller = scene, scene.task, controller
         self.suite, self.seed = suite, seed

@@ -21,7 +21,11 @@ def to_dict(section: Any) -> dict[str, Any]:
 
 
 def from_dict(kind: type[T], values: Any) -> T:
-    """Builds a dataclass from JSON values and defaults; raises `ConfigError` for invalid ones."""
+    """Builds a dataclass from `to_dict`'s values; missing fields take their defaults.
+
+    Raises:
+      ConfigError: if a field is unknown, or a value has the wrong type or is out of bounds.
+    """
     return parse(kind, values, ConfigError)
 
 
@@ -39,7 +43,11 @@ def read_config(file: Path) -> Config:
 
 
 def read_run_config(path: Path) -> Config:
-    """Reads the config of an unfinished run; raises `RunFolderError` if that is impossible."""
+    """Reads the config of an unfinished run.
+
+    Raises:
+      RunFolderError: if `path` is not a run folder, its run is finished, or its config is invalid.
+    """
     file = unfinished_run(path).config
     try:
         return read_config(file)
@@ -48,7 +56,11 @@ def read_run_config(path: Path) -> Config:
 
 
 def check_same_config(saved: Config, config: Config, path: Path) -> None:
-    """Raises `RunFolderError` with the field if the run in `path` is resumed otherwise."""
+    """Checks that the run in `path`, of config `saved`, is resumed with the same config.
+
+    Raises:
+      RunFolderError: names the first field that differs.
+    """
     before = flatten(to_dict(saved))
     for name, value in flatten(to_dict(config)).items():
         if before[name] != value:

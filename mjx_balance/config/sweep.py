@@ -18,8 +18,10 @@ WHOLE = ("epsilon_decay_steps",)  #: integer fields among them
 def sweep_grid(config: Config) -> list[dict[str, float]]:
     """Returns all combinations of the sweep's values as {field: value}, the last field fastest.
 
-    Without a sweep, that is one empty combination. Raises `ConfigError` for an entry that names no
-    field of `SWEEPABLE`, or lists no numbers.
+    Without a sweep, that is one empty combination.
+
+    Raises:
+      ConfigError: if an entry names no field of `SWEEPABLE`, or lists no numbers.
     """
     fields: dict[str, list[float]] = {}
     for entry in config.sweep:

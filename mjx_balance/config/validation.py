@@ -10,7 +10,11 @@ MOST_STEPS = 10_000  #: greatest number of physics steps per decision
 
 
 def check(config: Config) -> Config:
-    """Returns `config` if it is valid; raises `ConfigError` with field, value and remedy."""
+    """Returns `config` if it is valid; `robots.limits.check_robot` checks it against its robot.
+
+    Raises:
+      ConfigError: names the first invalid field, its value and a remedy.
+    """
     if not isinstance(config, Config):
         raise ConfigError(
             f"config is {quote(config)}; it must be a Config, as `preset` and `for_robot` return"

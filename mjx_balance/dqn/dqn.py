@@ -159,12 +159,14 @@ class DQN:
     ) -> Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]:
         """Returns the jitted training program: state -> (state, metrics), with the state donated.
 
-        A call takes `iterations` decisions of every env. Metrics are means over the call, with a
-        leading seed axis if there are several seeds. A metric without values is NaN, e.g. the loss
-        of a call without updates.
+        Metrics are means over the call, with a leading seed axis if there are several seeds. A
+        metric without values is NaN, e.g. the loss of a call without updates.
 
         Wait for a result every few calls: XLA runs at most 32 launches of CPU devices at once, and
         launches that wait for one that has not started deadlock.
+
+        Args:
+          iterations: decisions of every env per call.
         """
         iteration = self._each_seed(self.iteration, in_axes=(0, None))
 
@@ -192,7 +194,11 @@ class DQN:
     # The methods below handle one run, on each device.
 
     def initial_state(self, key: PRNGKeyArray, sweep: dict[str, jax.Array]) -> TrainState:
-        """The state of a new run; raises TypeError if the env observes a dictionary."""
+        """The state of a new run.
+
+        Raises:
+          TypeError: if the env observes a dictionary, as brax allows.
+        """
         spec, config = self.spec, self.spec.config
         key, key_params, key_env = jax.random.split(key, 3)
         local_envs = spec.per_device(spec.num_envs)
@@ -220,7 +226,12 @@ class DQN:
         )
 
     def iteration(self, state: TrainState, observing: Bool[Array, ""]) -> tuple[TrainState, Means]:
-        """One decision of every env, then the updates; `observing` adds to the statistics."""
+        """One decision of every env, then the updates.
+
+        Args:
+          state: this device's part of the state of one run.
+          observing: whether to add the observations to the statistics.
+        """
         key, key_act, key_reset, key_update = jax.random.split(state.key, 4)
         swept: Any = state.sweep
         config = dataclasses.replace(self.spec.config, **swept)  # swept fields are arrays
@@ -309,9 +320,15 @@ class DQN:
     ) -> tuple[UpdateState, Mean]:
         """One gradient step, and the target network's copy if it is due.
 
-        `batch` is this device's share, (share, ...) per field; `config` has the run's swept fields.
-        Returns the state, unchanged if loss or gradient are not finite, and the loss over all
-        devices, as a mean with count 1, or 0 if the step was skipped.
+        Args:
+          state: the same on every device, before and after.
+          batch: this device's share, (share, ...) per field.
+          statistics: for the whitening.
+          config: with the swept fields of this run.
+
+        Returns:
+          The state, unchanged if loss or gradient are not finite; the loss over all devices, as a
+          mean with count 1, or 0 if the step was skipped.
         """
 
         def loss_of(params: Params) -> jax.Array:
@@ -419,10 +436,16 @@ def epsilon_greedy(
 def exploration_noise(
     key: PRNGKeyArray, action: jax.Array, factors: Sequence[int], levels: int
 ) -> Int[Array, ""]:
-    """Moves each digit of an action index by up to `levels`, uniformly; digits are clipped.
+    """Moves each digit of an action index by up to `levels`, uniformly.
 
     The reward of a greedy action shows its distance from the best action, but not the direction;
-    the rewards of its neighbours do. `factors` are the numbers of levels of the digits.
+    the rewards of its neighbours show the direction.
+
+    Args:
+      key: PRNG key.
+      action: index, a mixed-radix number.
+      factors: number of levels of each digit.
+      levels: greatest move; digits are clipped.
     """
     move = jax.random.randint(key, (len(factors),), -levels, levels + 1)
     digits = jnp.stack(jnp.unravel_index(action, tuple(factors))) + move

@@ -48,7 +48,13 @@ class QNetwork(nn.Module):
         return heads.Radial(out, profile, stretch, factors)
 
     def fold_whitening(self, params: Any, mean: jax.Array, matrix: jax.Array) -> Any:
-        """Returns parameters for obs that equal `params` for (obs - mean) @ matrix."""
+        """Returns parameters for obs that equal `params` for (obs - mean) @ matrix.
+
+        Args:
+          params: this network's variables.
+          mean: (obs_size,)
+          matrix: (obs_size, obs_size)
+        """
         layers = dict(params["params"])
         input_kernels = [("hidden_0", 0)]  # layer, first row that multiplies the observation
         if self.radial:

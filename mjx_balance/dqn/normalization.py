@@ -37,7 +37,13 @@ def init(obs_size: int, floor: float) -> RunningStatistics:
 def observe(
     statistics: RunningStatistics, obs: Float[Array, "envs obs"], floor: float
 ) -> RunningStatistics:
-    """Adds the finite observations of all devices as one batch; `obs` are this device's."""
+    """Adds the finite observations of all devices as one batch.
+
+    Args:
+      statistics: so far.
+      obs: this device's observations.
+      floor: see `whitening_matrix`.
+    """
     mask = jax.vmap(all_finite)(obs)[:, None]
     count = jax.lax.psum(mask.sum(), AXIS)
     mean: jax.Array = jax.lax.psum(jnp.where(mask, obs, 0.0).sum(axis=0), AXIS) / count

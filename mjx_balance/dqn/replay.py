@@ -36,9 +36,15 @@ class ReplayState(NamedTuple):
 
 
 def init(example: Transition, capacity: int, batch: int) -> ReplayState:
-    """Allocates an empty buffer; the capacity is rounded down to whole batches of `batch` rows.
+    """Allocates an empty buffer.
 
-    `example` is a transition, for shapes and dtypes. Raises ValueError if not even one batch fits.
+    Args:
+      example: one transition, for shapes and dtypes.
+      capacity: rows; rounded down to a whole number of batches.
+      batch: rows per `add`.
+
+    Raises:
+      ValueError: if not even one batch fits.
     """
     if capacity < batch:
         raise ValueError(f"capacity {capacity} does not hold one batch of {batch} transitions")
@@ -48,7 +54,11 @@ def init(example: Transition, capacity: int, batch: int) -> ReplayState:
 
 
 def add(state: ReplayState, batch: Transition, valid: Bool[Array, ""] | bool = True) -> ReplayState:
-    """Overwrites the oldest rows with a batch if `valid`; its rows must divide the capacity."""
+    """Overwrites the oldest rows with a batch, (batch, ...) per field, if it is `valid`.
+
+    Raises:
+      ValueError: if the batch does not divide the capacity.
+    """
     capacity, rows = len(state.data.action), len(batch.action)
     if capacity % rows:
         raise ValueError(f"batch of {rows} rows does not divide the capacity, {capacity}")

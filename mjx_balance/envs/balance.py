@@ -49,11 +49,16 @@ class BalanceEnv(Env):
     """Metrics of `State.metrics` that are logged otherwise than as a mean under their own name."""
 
     def __init__(self, config: Config | None = None, action: str = "discrete"):
-        """Builds the scene of a config, or of the preset "default".
+        """Builds the scene.
 
-        `robots.limits.for_robot` makes the config of another robot. `action` is "discrete", the
-        paper's grid, or "continuous", a_x and a_y as shares of `action_max`, -1 to 1. Raises
-        `ConfigError` if the config cannot be run, or for another kind of action.
+        Args:
+          config: the preset "default" if none; `robots.limits.for_robot` makes
+            another robot's.
+          action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
+            `action_max`, -1 to 1.
+
+        Raises:
+          ConfigError: if the config cannot be run, or for another kind of action.
         """
         self._discrete = check_action(action) == "discrete"
         self.config = check(config or preset("default"))

@@ -31,7 +31,14 @@ def draw_episodes(
     robot: Robot,
     rngs: Sequence[np.random.Generator],
 ) -> Episodes:
-    """Draws episodes of training as `BalanceEnv` does, each and its noise from its generator."""
+    """Draws episodes of training, each from its own generator, as `BalanceEnv` draws its own.
+
+    Args:
+      task: of the scenarios.
+      ranges: of domain parameters and pushes.
+      robot: the nominal friction.
+      rngs: of each episode; its sensor noise comes from it, too.
+    """
     due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
     params, pushes = None, None
     scenarios = [

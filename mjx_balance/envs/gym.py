@@ -151,7 +151,11 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts a fresh scenario; without a seed the generator goes on. Options are refused."""
+        """Starts a fresh scenario from the settled stance; without a seed the generator goes on.
+
+        Raises:
+          ValueError: if there are options; none exist.
+        """
         _check_options(options)
         super().reset(seed=seed)
         obs = self._start([self.np_random], np.arange(1))
@@ -161,7 +165,12 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
         return obs[0], {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Takes one decision; raises `InvalidAction`, or `ResetNeeded` without an episode."""
+        """Takes one decision.
+
+        Raises:
+          InvalidAction: for what is not in the action space.
+          ResetNeeded: before the first reset, and after the end of an episode.
+        """
         if not self._running or self.batch is None:
             raise ResetNeeded(NO_EPISODE)
         outcome = self.batch.step(self._height_changes(action, self.action_space)[None])
@@ -230,7 +239,10 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Starts fresh scenarios in all envs.
 
         Env k gets seed `seed + k`, or `seed[k]`; one that gets none goes on with its generator.
-        Raises ValueError for options, or if there are not as many seeds as envs.
+
+        Raises:
+          ValueError: if there are options (none exist; `reset_mask` is for envs that do not reset
+            by themselves), or not as many seeds as envs.
         """
         _check_options(options)
         seeds = _seeds(seed, self.num_envs)
@@ -244,7 +256,12 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Takes one decision in every env; raises `InvalidAction`, or `ResetNeeded` at first."""
+        """Takes one decision in every env.
+
+        Raises:
+          InvalidAction: for what is not in the action space.
+          ResetNeeded: before the first reset.
+        """
         if self.batch is None:
             raise ResetNeeded(NO_EPISODE)
         outcome = self.batch.step(self._height_changes(actions, self.action_space))

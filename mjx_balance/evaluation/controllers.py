@@ -79,7 +79,13 @@ class AttitudePD:
     """Proportional and derivative control on the true attitude and angular rate."""
 
     def __init__(self, scene: Scene, proportional: float = 1.3, rate: float = 0.12):
-        """Takes the share of the tilt to undo, and the rate's time, s (benchmarks/limits.py)."""
+        """Takes the gains.
+
+        Args:
+          scene: task and addresses.
+          proportional: share of the tilt undone by one decision (benchmarks/limits.py).
+          rate: time for which the present rate is undone beforehand, s (same).
+        """
         self.scene, self.task = scene, scene.task
         self.proportional, self.rate = proportional, rate
         self.gain = measure_response(scene).gain
@@ -142,7 +148,13 @@ class Predictive:
     """
 
     def __init__(self, scene: Scene, forecast: Callable[..., np.ndarray]):
-        """Takes (task, scenario, now (n,), ahead (m,)) -> change of the board (n, m, 2), deg."""
+        """Prepares the quadratic programme.
+
+        Args:
+          scene: task and addresses.
+          forecast: (task, scenario, now (n,), ahead (m,)) -> (n, m, 2) change of the
+            board's angles, deg.
+        """
         self.scene, self.task, self.forecast = scene, scene.task, forecast
         response, steps = measure_response(scene), self.task.sim_steps
         self.gain = response.gain

@@ -47,7 +47,11 @@ def envelope(
     seed: int,
     progress: Progress = lambda share: None,
 ) -> Envelope:
-    """Maps falls and tilt over inclines and board speeds; `scenarios` of suite `corner` a cell."""
+    """Maps falls and tilt over inclines and board speeds, with targets of suite `corner`.
+
+    Raises:
+      EvaluationError: if there are no scenarios.
+    """
     if scenarios < 1:
         raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
     cells = [(i, r) for i in ENVELOPE_INCLINES for r in ENVELOPE_RATES]

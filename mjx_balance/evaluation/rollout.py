@@ -79,7 +79,16 @@ def roll_out(
     record: bool = False,
     progress: Progress = lambda share: None,
 ) -> Rollout:
-    """Runs a controller in plain MuJoCo for `duration` s, rounded up to whole decisions."""
+    """Runs a controller in plain MuJoCo.
+
+    Args:
+      scene: task, model and stance.
+      controller: chooses the actions.
+      episodes: of each scenario.
+      duration: s, rounded up to whole decisions.
+      record: whether to record every qpos.
+      progress: called with the share done.
+    """
     task, env = scene.task, BatchEnv(scene, episodes)
     count, decisions = env.num_envs, int(np.ceil(duration / task.ctrl_dt - 1e-9))
     steps = decisions * task.sim_steps
@@ -164,7 +173,12 @@ def settled_action(rollout: Rollout) -> float | None:
 
 
 def policy_scene(policy: Policy, robot: str | None = None) -> Scene:
-    """Builds a policy's scene, with its robot's name here; raises `PolicyError` if it differs."""
+    """Builds the scene a policy was trained in; `robot` is the name of its robot here.
+
+    Raises:
+      PolicyError: if the robot is not here, is another one, or today's scene files or engine
+        give another scene.
+    """
     name = robot or policy.config.robot
     try:
         robot_here = find_robot(name)
@@ -193,16 +207,25 @@ def evaluate(
     seed: int,
     progress: Progress = lambda share: None,
 ) -> dict[str, Any]:
-    """Evaluates a policy: JSON of `summarize`; raises as `run_suite` and `policy_scene`."""
+    """Evaluates a policy in plain MuJoCo; returns the JSON of `summarize`.
+
+    Raises:
+      EvaluationError, SuiteError: as `run_suite`.
+      PolicyError: as `policy_scene`.
+    """
     scene = policy_scene(policy)
     rollout = run_suite(scene, observing(policy), suite, scenarios, duration, seed, progress)
     return summarize(rollout, suite, duration, seed)
 
 
 def check_fits(task: TaskConfig, scenarios: int, duration: float, recorded: int = 0) -> None:
-    """Raises `EvaluationError` for an evaluation of nothing, or of more than the memory holds.
+    """Refuses an evaluation of nothing, or of more than the memory holds.
 
-    Scenarios last `duration` s; `recorded` values are stored per physics step, besides the tilt.
+    Its scenarios last `duration` s; `recorded` values are stored per physics step, besides the
+    tilt.
+
+    Raises:
+      EvaluationError: with the estimate.
     """
     if scenarios < 1:
         raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
@@ -228,7 +251,12 @@ def run_suite(
     progress: Progress = lambda share: None,
     record: bool = False,
 ) -> Rollout:
-    """Rolls a controller out on a suite's scenarios; raises as `check_fits` and `draw_suite`."""
+    """Rolls a controller out on a suite's scenarios.
+
+    Raises:
+      EvaluationError: if there are no scenarios or no time, or too much for the memory.
+      SuiteError: as `draw_suite`.
+    """
     check_fits(scene.task, scenarios, duration, scene.model.nq if record else 0)
     episodes = draw_suite(scene.task, scene.robot, suite, scenarios, duration, seed)
     return roll_out(scene, controller, episodes, duration, record, progress)

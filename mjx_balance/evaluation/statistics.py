@@ -38,10 +38,14 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 def over_seeds(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Summarises one suite's evaluations, JSON of `rollout.summarize`, one per training seed.
+    """Summarises one suite's evaluations, one per training seed.
 
-    Returns seeds, the sums of falls and scenarios, and for each of mean, p95 and max the
-    interquartile mean, its interval, and the worst seed's value.
+    Args:
+      results: JSON of `rollout.summarize`, one per seed.
+
+    Returns:
+      seeds, falls (their sum), scenarios (their sum), and for each of mean, p95 and max the
+      interquartile mean, its interval, and the worst seed's value.
     """
     summary: dict[str, Any] = {"seeds": len(results)}
     summary |= {name: sum(r[name] for r in results) for name in ("scenarios", "falls")}

@@ -83,8 +83,11 @@ def draw_suite(
     """Draws a suite's episodes, each of `duration` s.
 
     Scenario k of a seed is the same however many are drawn. Scenario, sensor noise and pushes come
-    from generators of their own, told apart by their last number. Raises `SuiteError` for an
-    unknown suite, a negative seed, or a board that does not arrive before its next target.
+    from generators of their own, told apart by their last number.
+
+    Raises:
+      SuiteError: for an unknown suite, a negative seed, or a board that does not arrive
+        before its next target.
     """
     if suite not in SUITES:
         raise SuiteError(f"unknown suite {suite!r}; known suites: {', '.join(SUITES)}")

@@ -53,7 +53,13 @@ class RunFolder:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Writes a file whole or, with an OSError, not at all; follows links, pipes and devices."""
+    """Writes a file atomically, even if the process or the machine dies.
+
+    Follows links, and writes to pipes and devices directly.
+
+    Raises:
+      OSError: if it cannot be written; the old content then stays.
+    """
     data = content.encode() if isinstance(content, str) else content
     target = path.resolve()
     part = target.with_name(f"{target.name}.part")
@@ -81,7 +87,11 @@ def write_json(path: Path, values: Any) -> None:
 def create_run_folder(
     path: Path, config: Mapping[str, Any], provenance: Mapping[str, Any]
 ) -> RunFolder:
-    """Creates a run folder whole, or raises `RunFolderError` if it exists or is not writable."""
+    """Creates a run folder with config and provenance (`check_same_provenance`), atomically.
+
+    Raises:
+      RunFolderError: if the folder exists or cannot be written; nothing changes then.
+    """
     if path.exists():
         raise RunFolderError(
             f"run folder {path} exists; choose another with --run-dir, or continue it with "
@@ -157,10 +167,17 @@ def parse_json(content: bytes) -> Any:
 
 
 def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
-    """Compares a run's provenance with today's; returns a warning if only `versions` differ.
+    """Compares a run's saved provenance with today's.
 
-    The run can then go on, but not to the same bits. Raises `RunFolderError` if the saved file is
-    invalid, or something else differs.
+    Args:
+      path: of the run.
+      today: `versions` {library: version}, and by name all else that determines the run.
+
+    Returns:
+      A warning if only versions differ, so that the run can go on, but not to the same bits.
+
+    Raises:
+      RunFolderError: if the saved file is invalid, or something else differs.
     """
     file = RunFolder(path).provenance
     try:

@@ -7,7 +7,15 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def code(module: str, package: Path = PACKAGE) -> dict[str, str]:
-    """Returns {module: code without docstrings} of a module and all it imports in this package."""
+    """Collects a module and all that it imports from this package, directly or indirectly.
+
+    Args:
+      module: full dotted name.
+      package: folder of mjx_balance.
+
+    Returns:
+      {module: code}, without comments and docstrings.
+    """
     modules: dict[str, str] = {}
     names = [module]
     while names:

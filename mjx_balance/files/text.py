@@ -4,7 +4,12 @@ MESSAGE = 300  #: greatest length of another library's error in a message, chara
 
 
 def shorten(text: object, limit: int = 80) -> str:
-    """Returns `str(text)` in one line of at most `limit` characters; "..." ends longer text."""
+    """Returns text in one line of at most `limit` characters, without control characters.
+
+    Args:
+      text: any object; its `str` counts.
+      limit: greatest length; longer text ends in "...".
+    """
     line = " ".join(str(text)[: 4 * limit].split())
     line = "".join(letter if letter.isprintable() else "?" for letter in line)
     cut = len(line) > limit or len(str(text)) > 4 * limit

@@ -57,7 +57,11 @@ def _adapter(kind: Any) -> Any:
 
 
 def check_types(value: T, error: type[InputError] = InputError) -> T:
-    """Returns a dataclass with valid fields; else raises `error` with field, value and remedy."""
+    """Returns a dataclass if its fields have the types and bounds that its class declares.
+
+    Raises:
+      InputError: of class `error`; names the first invalid field, its value and a remedy.
+    """
     try:
         _adapter(type(value)).validate_python(value)
     except ValueError as broken:
@@ -72,10 +76,17 @@ def parse(
     remedies: Mapping[str, str] | None = None,
     name: str = "",
 ) -> T:
-    """Builds a dataclass, or a value of another type, from JSON values; raises as `check_types`.
+    """Builds a dataclass, or a value of another type, from JSON values.
 
-    `remedies` maps fields to the end of "it must ..." where it differs from `REMEDIES`; `name` is
-    that of the value in messages, if it is not the type's.
+    Args:
+      kind: the type.
+      values: from `json.loads` or `tomllib.loads`.
+      error: class to raise.
+      remedies: {field: end of "it must ..."}, where it differs from `REMEDIES`.
+      name: of the value in messages; "": the type's.
+
+    Raises:
+      InputError: as `check_types`.
     """
     try:
         return _adapter(kind).validate_json(json.dumps(values, default=str), strict=True)

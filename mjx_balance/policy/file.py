@@ -35,9 +35,15 @@ def save_policy(
 ) -> Policy:
     """Writes a policy file atomically.
 
-    `params` are the flax network's variables, {"params": {layer: {kernel, bias}, name: array}}, or
-    arrays by name. Raises `PolicyError` if they do not match the manifest, OSError if the file
-    cannot be written.
+    Args:
+      path: file to write.
+      params: the flax network's variables, {"params": {layer: {kernel, bias}, name: array}}, or
+        arrays by name.
+      manifest: from `make_manifest`.
+
+    Raises:
+      PolicyError: if weights and manifest do not match.
+      OSError: if the file cannot be written.
     """
     weights = flat_weights(params)
     policy = Policy(manifest, weights)
@@ -49,8 +55,13 @@ def save_policy(
 def convert_policy(path: Path, out: Path) -> Policy:
     """Writes a policy file of format 4 or 5 in format 5, atomically, with the same weights.
 
-    Raises `PolicyError` if `path` is no such file; OSError if `out`, which may be the same file,
-    cannot be written.
+    Args:
+      path: file to read.
+      out: file to write; may be the same.
+
+    Raises:
+      PolicyError: if `path` is not a policy of these formats.
+      OSError: if `out` cannot be written; an old file then stays.
     """
     manifest, weights = read_policy(path)
     with naming(path):
@@ -67,7 +78,14 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def find_policy(name: str | os.PathLike[str]) -> Path:
-    """Finds a policy by file, run folder or shipped name; raises `PolicyError` if there is none."""
+    """Finds a policy file.
+
+    Args:
+      name: path of the file or of a run folder, or the name of a shipped policy.
+
+    Raises:
+      PolicyError: if there is none.
+    """
     path, shipped = Path(name), shipped_policies()
     try:
         for file in (path, RunFolder(path).policy):
@@ -86,10 +104,16 @@ def find_policy(name: str | os.PathLike[str]) -> Path:
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Loads a policy by its file, its run folder, or its name if it is shipped.
+    """Loads a policy.
 
-    It maps observations (obs_size,) or (batch, obs_size) to action indices () or (batch,).
-    Raises `PolicyError` if the file is missing, truncated, or no policy that this release can run.
+    Args:
+      path: path of the file or of a run folder, or the name of a shipped policy.
+
+    Returns:
+      A callable: observations (obs_size,) or (batch, obs_size) -> action indices () or (batch,).
+
+    Raises:
+      PolicyError: if the file is missing, truncated, or not a policy that this release can run.
     """
     path = find_policy(path)
     manifest, weights = read_policy(path)
@@ -98,7 +122,11 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 
 def read_policy(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
-    """Reads manifest and weights of a policy file of any version; raises `PolicyError`."""
+    """Reads manifest (JSON) and weights by name of a policy file of any version.
+
+    Raises:
+      PolicyError: if the file is not safetensors with float32 weights and a JSON manifest.
+    """
     size = path.stat().st_size
     if size > MOST_BYTES:
         raise PolicyError(f"{path} has {size} bytes; no policy has more than {MOST_BYTES}")

@@ -40,7 +40,13 @@ def naming(subject: object) -> Iterator[None]:
 
 
 def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the manifest of a policy, as JSON values; `training` is provenance."""
+    """Returns the manifest of a policy, as JSON values.
+
+    Args:
+      config: of the training.
+      scene_hash: fingerprint of the training's scene.
+      training: provenance, e.g. decisions and seconds.
+    """
     return {
         "format": FORMAT,
         "version": FORMAT_VERSION,
@@ -84,7 +90,12 @@ def network_factors(config: Config) -> tuple[int, ...]:
 
 
 def read_manifest(manifest: Any) -> tuple[Config, Robot]:
-    """Returns a manifest's config and robot; raises `PolicyError` if a part does not fit them."""
+    """Checks a manifest, and returns its config and robot.
+
+    Raises:
+      PolicyError: if format or version differ, config or robot are invalid, or another part does
+        not follow from them.
+    """
     if not isinstance(manifest, dict):
         raise PolicyError("its manifest is not a JSON object")
     for name, expected in (("format", FORMAT), ("version", FORMAT_VERSION)):
@@ -102,8 +113,10 @@ def read_manifest(manifest: Any) -> tuple[Config, Robot]:
 def upgrade(manifest: Any) -> Any:
     """Returns a manifest of format 4 in format 5, and anything else unchanged.
 
-    Format 4 has only names and scales of the observation; format 5 has the rows as `inputs`. Raises
-    `PolicyError` for invalid parts.
+    Format 4 has only names and scales of the observation; format 5 has the rows as `inputs`.
+
+    Raises:
+      PolicyError: if a part has the wrong type, or config or robot are invalid.
     """
     if not isinstance(manifest, dict):
         return manifest

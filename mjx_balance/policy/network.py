@@ -20,7 +20,15 @@ class Policy:
     """
 
     def __init__(self, manifest: dict[str, Any], weights: Mapping[str, np.ndarray]):
-        """Takes weights as `flat_weights`; raises `PolicyError` if they do not fit the manifest."""
+        """Checks manifest and weights.
+
+        Args:
+          manifest: from `make_manifest` or a file.
+          weights: {name: float32 array}, as `flat_weights`.
+
+        Raises:
+          PolicyError: if manifest and weights do not match, or one of them is invalid.
+        """
         self.config, self.robot = read_manifest(manifest)
         self.manifest = manifest
         self.scene_hash: str = manifest["scene_hash"]
@@ -52,9 +60,16 @@ class Policy:
         return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
     def q_values(self, obs: np.ndarray) -> np.ndarray:
-        """Action values of scaled observations; raises ValueError if they have another size.
+        """Action values.
 
-        (obs_size,) -> (num_actions,) or (batch, obs_size) -> (batch, num_actions), float32.
+        Args:
+          obs: (obs_size,) or (batch, obs_size) scaled observations.
+
+        Returns:
+          (num_actions,) or (batch, num_actions) float32.
+
+        Raises:
+          ValueError: if obs has another size.
         """
         return self._head(obs).q_values()
 

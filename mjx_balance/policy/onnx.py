@@ -27,7 +27,18 @@ ABOUT = (
 
 
 def export_onnx(policy: Policy, path: Path) -> int:
-    """Writes a policy as an ONNX model, atomically; returns the file's size, bytes."""
+    """Writes a policy as an ONNX model, atomically.
+
+    Args:
+      policy: with any head.
+      path: file to write.
+
+    Returns:
+      Size of the file, bytes.
+
+    Raises:
+      OSError: if it cannot be written; an old file then stays.
+    """
     content = onnx_model(policy).SerializeToString()
     write_atomically(path, content)
     return len(content)

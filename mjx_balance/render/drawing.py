@@ -42,8 +42,13 @@ class RenderError(RuntimeError):
 def write(path: Path, scene: Scene, qpos: np.ndarray) -> None:
     """Draws the first state to a `.png` file, or all states to a video, atomically.
 
-    Any suffix but `.png` makes a video, at real speed. `qpos` (steps, nq) has one state per physics
-    step. Raises `RenderError` if no OpenGL backend works here, or the file cannot be written.
+    Args:
+      path: file to write; any suffix but `.png` makes a video, at real speed.
+      scene: robot, board and time step.
+      qpos: (steps, nq), one state per physics step.
+
+    Raises:
+      RenderError: if no OpenGL backend works here, or the file cannot be written.
     """
     import imageio.v2 as imageio
 
@@ -69,7 +74,11 @@ class Painter:
     """Draws states one by one in a child process, which runs until `close`."""
 
     def __init__(self, scene: Scene, size: tuple[int, int] = VIDEO_SIZE):
-        """Starts the process; pictures have `size` (width, height). Raises `RenderError`."""
+        """Starts the process, for pictures of the scene; `size` is (width, height).
+
+        Raises:
+          RenderError: if no OpenGL backend works here.
+        """
         self._size, reason = size, ""
         where = {"task": to_dict(scene.task), "robot": scene.robot_source}
         header = json.dumps(where | {"size": size})
@@ -86,7 +95,11 @@ class Painter:
         raise _render_error(reason)
 
     def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """Draws a state (nq,) as RGB (height, width, 3), uint8; raises `RenderError`."""
+        """Draws a state (nq,); returns an RGB picture (height, width, 3), uint8.
+
+        Raises:
+          RenderError: if the child process has died.
+        """
         width, height = self._size
         state = np.ascontiguousarray(qpos, float).tobytes()
         picture = self._ask(state, height * width * 3)
@@ -121,7 +134,11 @@ class Window:
     """MuJoCo's viewer; plays states at real speed."""
 
     def __init__(self, scene: Scene, on_key: Callable[[int], None] | None = None):
-        """Opens it; `on_key` gets each key's GLFW code. Raises `RenderError` without a display."""
+        """Opens the window; `on_key` is called with the GLFW code of every key that is pressed.
+
+        Raises:
+          RenderError: if there is no display, or macOS needs `mjpython`.
+        """
         _check_display()
         import mujoco.viewer
 

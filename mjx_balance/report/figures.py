@@ -43,7 +43,15 @@ def draw_figures(
     scene: Scene,
     rollouts: Mapping[str, Rollout],
 ) -> list[Path]:
-    """Draws a run's figures into a folder, created if need be; returns the files written."""
+    """Draws a run's figures; returns the files written.
+
+    Args:
+      folder: to write them to; created if it does not exist.
+      metrics: the lines of metrics.jsonl.
+      task: defines the reward.
+      scene: of the rollouts.
+      rollouts: see `rollout_figure`.
+    """
     folder.mkdir(exist_ok=True)
     drawings = {
         folder / "learning_curves.png": learning_curves([metrics]),
@@ -79,7 +87,14 @@ HELD_OUT = {f"eval/{suite}/tilt_mean": f"held out, {suite}" for suite in HEADLIN
 
 @styled
 def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
-    """Tilt, falls, reward, loss, epsilon and speed over env steps: median and extremes of runs."""
+    """Tilt, falls, reward, loss, epsilon and speed over env steps.
+
+    A line shows the median over runs and seeds, a band the extremes. Each point in the tilt panel
+    is one validation of one seed.
+
+    Args:
+      runs: the lines of metrics.jsonl of each run.
+    """
     figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
     longest = max(runs, key=lambda run: run[-1]["env_steps"])
     steps = np.asarray([m["env_steps"] for m in longest])
@@ -154,7 +169,12 @@ def reward_figure(task: TaskConfig) -> plt.Figure:
 
 @styled
 def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
-    """The paper's Fig. 7: board and body angles over time; a column per recorded rollout."""
+    """The paper's Fig. 7: board and body angles over time in plain MuJoCo.
+
+    Args:
+      scene: of the rollouts.
+      rollouts: name -> rollout of one scenario with `qpos`; one column each.
+    """
     count, size = len(rollouts), (max(11, 6.5 * len(rollouts)), 7)
     figure, axes = plt.subplots(
         4, count, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
@@ -190,7 +210,12 @@ def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
 
 @styled
 def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figure:
-    """Share of the time in which the tilt exceeds a value, from shares per bin of `edges`, deg."""
+    """Share of the time in which the body tilt exceeds a value, over that value.
+
+    Args:
+      shares: name -> (len(edges) - 1,) share of the physics steps per bin of tilt.
+      edges: (bins + 1,) bounds of the bins, deg.
+    """
     figure, axis = plt.subplots(figsize=(9, 3.8), layout="constrained")
     for (name, share), colour in zip(shares.items(), (BLUE, *SHADES), strict=False):
         beyond = 1 - np.cumsum(share)
@@ -206,7 +231,12 @@ def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figu
 
 @styled
 def envelope_figure(envelope: Envelope, limit: float) -> plt.Figure:
-    """Fall rate and mean tilt, up to `limit` deg, over incline and board speed; its limits."""
+    """Fall rate and mean tilt over incline and board speed, with the physical limits.
+
+    Args:
+      envelope: from `evaluation.envelope`.
+      limit: end of the tilt's colour scale, deg.
+    """
     figure, axes = plt.subplots(1, 2, figsize=(12, 4.4), sharey=True, layout="constrained")
     maps = (
         (envelope.fall_rate, "share of the scenarios with a fall", "Reds", 1.0),

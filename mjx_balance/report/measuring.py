@@ -60,8 +60,12 @@ def load_or_measure(
 ) -> Measurements:
     """Measures policy and baselines, or reads an earlier result of the same measurement.
 
-    The JSON file of the result is replaced if it is damaged or outdated. `scenarios` is per suite
-    and controller; `progress` maps a title to a context that gives a callable for the share done.
+    Args:
+      policy: has the name `policy` in the results.
+      scene: the policy's.
+      file: JSON file that stores the result; missing, damaged or outdated ones are replaced.
+      scenarios: per suite and controller.
+      progress: title -> context manager that gives a callable taking the share done.
     """
     key = [policy.fingerprint, to_dict(policy.config), scene.hash, code_digest()]
     key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
@@ -76,7 +80,12 @@ def load_or_measure(
 
 
 def parse_measurements(saved: dict[str, Any]) -> Measurements:
-    """Checks a stored result; raises `ReportError`, or KeyError for a missing value."""
+    """Checks a stored result, JSON of `Measurements`, value by value.
+
+    Raises:
+      ReportError: for an invalid value.
+      KeyError: for a missing one.
+    """
     results, shares = saved["results"], parse(_Shares, saved["shares"], ReportError)
     cells = parse(Envelope, saved["envelope"], ReportError)
     for grid in (cells.fall_rate, cells.mean_tilt):
@@ -115,7 +124,13 @@ def _measure(
 def record_rollout(
     policy: Policy, suite: str, duration: float, seed: int, controller: str = "policy"
 ) -> Rollout:
-    """Records one scenario of `duration` s of the policy or a baseline; as `policy_scene`."""
+    """Runs one scenario of `duration` s and records every state, for a figure or a video.
+
+    The controller is `policy`, or the name of a baseline to run in its place.
+
+    Raises:
+      PolicyError: if the policy belongs to another scene.
+    """
     scene = policy_scene(policy)
     acting = _controller(controller, policy, scene)
     return run_suite(scene, acting, suite, 1, duration, seed, record=True)

@@ -41,8 +41,16 @@ def write_report(
     """Writes one self-contained HTML file; returns what is missing, one sentence each.
 
     It compares the first run that has a policy with the baselines, on scenarios of the report's
-    own seed, and saves these results in the run folder (`report.json`); `scenarios` and `progress`
-    as in `measuring.load_or_measure`. Raises `ReportError` for a folder that is no run folder.
+    own seed, and saves these results in the run folder (`report.json`).
+
+    Args:
+      run_dirs: run folders, complete or not.
+      out: file to write.
+      scenarios: per suite and controller.
+      progress: title -> context manager that gives a callable taking the share done.
+
+    Raises:
+      ReportError: for a folder that is no run folder.
     """
     runs = [read_run(path) for path in run_dirs]
     missing = [sentence for run in runs for sentence in run.missing]
@@ -129,7 +137,11 @@ def policy_pictures(policy: Policy, scene: Scene, measurements: Measurements) ->
 
 
 def video(policy: Policy) -> str:
-    """MP4 of a scenario of suite corner, in base64; raises `RenderError` without OpenGL."""
+    """MP4 of a scenario of suite corner, in base64.
+
+    Raises:
+      RenderError: if no OpenGL backend works here.
+    """
     rollout = measuring.record_rollout(policy, "corner", measuring.VIDEO_SECONDS, SEEDS.report)
     assert rollout.qpos is not None
     with tempfile.TemporaryDirectory() as folder:

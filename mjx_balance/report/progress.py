@@ -67,7 +67,12 @@ class Display:
 
     @contextmanager
     def training(self, done: int, total: int) -> Iterator[None]:
-        """Shows training from `done` to `total` decisions; call `update` inside."""
+        """Shows the progress of training; call `update` inside.
+
+        Args:
+          done: decisions before this training begins.
+          total: decisions at its end.
+        """
         self._total, self._done_at_start = total, done
         self._start = self._last = time.perf_counter()
         self._progress = bars.Progress(
@@ -88,7 +93,12 @@ class Display:
             yield
 
     def update(self, done: int, metrics: Mapping[str, float]) -> None:
-        """Shows metrics after `done` decisions; those of a validation stay until the next."""
+        """Shows new metrics; keeps those of the last validation until the next.
+
+        Args:
+          done: decisions so far.
+          metrics: by their logged names.
+        """
         held_out = {k: v for k, v in self._metrics.items() if k.startswith("eval/")}
         self._metrics = {**held_out, **metrics}
         self._progress.update(self._task, completed=min(done, self._total))

@@ -46,7 +46,11 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    """Reads all usable parts of a run folder; raises `ReportError` if there are none."""
+    """Reads all usable parts of a run folder.
+
+    Raises:
+      ReportError: if the folder does not exist or holds no part of a run.
+    """
     folder, run = RunFolder(path), Run(path)
     parts = (folder.config, folder.metrics, folder.policy, folder.evaluation)
     if not path.is_dir():
@@ -143,7 +147,14 @@ class _Line:
 
 
 def suite_results(value: Any) -> dict[str, dict[str, Any]]:
-    """Checks suite -> JSON of `summarize`; returns suite -> the fields of `SuiteResult`."""
+    """Checks an evaluation, suite -> JSON of `rollout.summarize`.
+
+    Returns:
+      Suite -> the fields of `SuiteResult`.
+
+    Raises:
+      ReportError: for a value that no evaluation returns.
+    """
     results = parse(dict[str, SuiteResult], value, ReportError, name="it")
     return {suite: _as_dict(result) for suite, result in results.items()}
 

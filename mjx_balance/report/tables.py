@@ -16,7 +16,11 @@ STATISTICS = ("mean", "p50", "p95", "p99", "max")  #: tilt statistics in the tab
 
 
 def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
-    """One row per suite of `results`, suite -> JSON of `rollout.summarize`."""
+    """One row per suite.
+
+    Args:
+      results: suite -> JSON of `rollout.summarize`.
+    """
     names = ("scenarios", "falls", *STATISTICS, "act mm")
     table = _table("plain MuJoCo, tilt in deg over every physics step", names, suites=True)
     for suite, result in results.items():
@@ -31,7 +35,12 @@ def evaluation_table(results: dict[str, dict[str, Any]]) -> Table:
 
 
 def sweep_table(ranked: list[dict[str, Any]]) -> Table:
-    """One row per combination of swept values, best first, as in sweep.json."""
+    """One row per combination of swept values.
+
+    Args:
+      ranked: combinations, best first, each with `values`, name -> value, and `statistics`,
+        suite -> `statistics.over_seeds`.
+    """
     title = "sweep, best first: falls, mean tilt in deg (95% interval over seeds)"
     table = _table(title, [*ranked[0]["values"], "seeds", *ranked[0]["statistics"]])
     for row in ranked:
@@ -45,7 +54,11 @@ def sweep_table(ranked: list[dict[str, Any]]) -> Table:
 
 
 def seeds_table(summary: dict[str, dict[str, Any]]) -> Table:
-    """One row per suite of `summary`, suite -> `statistics.over_seeds`."""
+    """One row per suite: interquartile means over the training seeds.
+
+    Args:
+      summary: suite -> `statistics.over_seeds`.
+    """
     seeds = max(row["seeds"] for row in summary.values())
     title = f"{seeds} seeds: interquartile mean, 95% bootstrap interval, tilt in deg"
     table = _table(title, ("falls", *TILTS), suites=True)

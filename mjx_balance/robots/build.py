@@ -39,7 +39,15 @@ def scene_dir() -> Path:
 
 
 def model_path(model: str, folder: Path) -> Path:
-    """Finds the file of `RobotFile.model`, which may be relative; raises `RobotError`."""
+    """Finds a model file.
+
+    Args:
+      model: `RobotFile.model`.
+      folder: folder that a relative path starts from.
+
+    Raises:
+      RobotError: if there is none.
+    """
     where, colon, inside = model.partition(":")
     if not colon or len(where) == 1:  # no prefix, or the letter of a Windows drive
         path = folder / model
@@ -85,7 +93,10 @@ def _menagerie(name: str) -> Path:
 def read_model(path: Path) -> mujoco.MjSpec:
     """Reads a model file; no visual geom is discarded and no static body is fused.
 
-    The root of a URDF gets a free joint if it has none. Raises `RobotError` with MuJoCo's message.
+    The root of a URDF gets a free joint if it has no joint.
+
+    Raises:
+      RobotError: with MuJoCo's message.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -114,10 +125,17 @@ def _mujoco_message(error: Exception) -> str:
 
 
 def build(file: RobotFile, visual: bool = False) -> tuple[mujoco.MjSpec, Robot]:
-    """Builds the body, its trunk's frame at the origin with x forward, and the robot's numbers.
+    """Builds a robot.
 
-    `visual` keeps the visual geoms. Raises `RobotError` if file and model do not match, or the
-    model is no four-legged robot.
+    Args:
+      file: the robot's file.
+      visual: whether to keep the visual geoms.
+
+    Returns:
+      The body, its trunk's frame at the origin with x forward, and the robot's numbers.
+
+    Raises:
+      RobotError: if file and model do not match, or the model is no four-legged robot.
     """
     try:
         return _build(file, visual)
@@ -343,7 +361,11 @@ def _leave_geoms(spec: mujoco.MjSpec, feet: list[mujoco.MjsGeom], visual: bool) 
 def _align(
     spec: mujoco.MjSpec, trunk: mujoco.MjsBody, model: mujoco.MjModel, file: RobotFile
 ) -> bool:
-    """Moves the trunk to the origin, turned by quarters to x forward; returns whether it turned."""
+    """Moves the trunk to the origin, and turns its contents by quarter turns to make x forward.
+
+    Returns:
+      Whether anything was turned.
+    """
     forward = _forward(file, pose(model, file.trunk))
     quarters = round(math.degrees(math.atan2(forward[1], forward[0])) / 90)
     trunk.pos, trunk.quat = [0, 0, 0], [1, 0, 0, 0]

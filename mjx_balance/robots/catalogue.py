@@ -21,7 +21,14 @@ def shipped() -> list[str]:
 
 
 def robot_file(name: str) -> RobotFile:
-    """Reads or drafts the file of a robot, named as `Config.robot`; raises `RobotError`."""
+    """Reads or drafts the file of a robot.
+
+    Args:
+      name: as `Config.robot`: a shipped robot's name, the path of a TOML file, or `menagerie:NAME`.
+
+    Raises:
+      RobotError: if there is none, or its file is invalid.
+    """
     if name.endswith(".toml"):
         return read_robot_file(Path(name))
     if name.startswith(MENAGERIE):

@@ -36,10 +36,15 @@ class _Leg(NamedTuple):
 
 
 def draft(model: str, path: Path) -> str:
-    """Returns the text of a robot file for the model at `path`, which it calls `model`.
+    """Returns the text of a robot file.
 
-    Raises `RobotError` if the model cannot be read, its trunk is not free, a corner has no leg or
-    two, or a joint has no name.
+    Args:
+      model: value of `model` in the file.
+      path: path of the model.
+
+    Raises:
+      RobotError: if the model cannot be read, its trunk is not free, a corner has no leg or two,
+        or a joint has no name.
     """
     compiled = compile_model(read_model(path), str(path))
     data = mujoco.MjData(compiled)

@@ -9,11 +9,14 @@ from mjx_balance.robots.robot import Robot
 
 
 def for_robot(config: Config, robot: str) -> Config:
-    """Adapts a config of our own robot to another one; raises `ConfigError` if there is none.
+    """Adapts a config of our own robot to another robot.
 
     Standing height and greatest height change become the robot's (`robots.measure`). Payloads scale
     with its mass; pushes, offsets and the scale of foot heights with its size. Angles, board rate
     and fall limit stay.
+
+    Raises:
+      ConfigError: if there is no such robot.
     """
     own = find_robot(robot)
     task = dataclasses.replace(
@@ -46,7 +49,11 @@ def authority(task: TaskConfig, robot: Robot) -> float:
 
 
 def check_robot(config: Config, robot: Robot) -> Config:
-    """Returns a checked config if the robot can do what it demands; else raises `ConfigError`."""
+    """Returns `config` if the robot can do what it demands; `config.check` comes before.
+
+    Raises:
+      ConfigError: names the field, its value and the robot.
+    """
     task, ranges = config.task, config.randomization
     lowest, highest = robot.height_range
     limit = greatest_incline(task, robot)

@@ -33,9 +33,14 @@ Range = tuple[float, float]  #: least and greatest turn of a link (`Leg`), rad
 def measure(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: float) -> Robot:
     """Measures a robot, and scales what its file leaves out to its mass and size.
 
-    `model` is compiled, x forward, with its maker's actuators; `feet` names each leg's foot geom,
-    of `radius` m. Raises `RobotError` if the kinematics of a leg do not fit, or the legs are too
-    short for the board.
+    Args:
+      file: the robot's file.
+      model: compiled, x forward, with its maker's actuators.
+      feet: name of each leg's foot geom.
+      radius: of the feet, m.
+
+    Raises:
+      RobotError: if the kinematics of a leg do not fit, or the legs are too short for the board.
     """
     legs = _with_corners([_leg(file, model, *one) for one in zip(file.legs, feet, strict=True)])
     _check_corners(file, legs)
@@ -72,7 +77,11 @@ def measure(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: flo
 
 
 def check_joints(model: mujoco.MjModel, file: RobotFile) -> None:
-    """Raises `RobotError` unless each leg is a chain of three hinges and no other joint is left."""
+    """Checks that every leg is a chain of three hinges, and that no other joint is left.
+
+    Raises:
+      RobotError: names the first joint that does not fit.
+    """
     moving = [joint.name for joint in map(model.joint, range(model.njnt)) if joint.type[0] != 0]
     for leg in file.legs:
         above = model.body(file.trunk).id
@@ -283,8 +292,15 @@ def _bend_to(
 ) -> tuple[Range, float, float] | None:
     """Range of a knee that points backward (-1) or forward (1), with the foot under the hip.
 
-    `hip` and `knee` are the limits of thigh and calf, `lengths` theirs, m. Returns the range, and
-    the whole turns to add to the zeros of hip and knee, rad; None if the limits leave no range.
+    Args:
+      side: -1 or 1.
+      hip: limits of the thigh.
+      knee: limits of the calf against the thigh.
+      lengths: of thigh and calf, m.
+
+    Returns:
+      The range, and the whole turns to add to the zeros of hip and knee, rad; none if the limits
+      leave no range.
     """
     first, last = sorted((0.0, side * math.pi))
     calf = max(WHOLE_TURNS, key=lambda k: min(knee[1] + k, last) - max(knee[0] + k, first))

@@ -91,7 +91,11 @@ REMEDIES = {
 
 
 def read_robot_file(path: Path) -> RobotFile:
-    """Reads a robot's TOML file; raises `RobotError` if it is missing, unreadable or invalid."""
+    """Reads a robot's TOML file.
+
+    Raises:
+      RobotError: if it is missing, unreadable or invalid.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -104,7 +108,15 @@ def read_robot_file(path: Path) -> RobotFile:
 
 
 def parse_robot_file(text: str, path: Path) -> RobotFile:
-    """Parses TOML; `path` gives name and folder. Raises `RobotError` with the first bad field."""
+    """Parses the content of a robot file.
+
+    Args:
+      text: TOML.
+      path: gives name and folder; need not exist.
+
+    Raises:
+      RobotError: names the first invalid field, its value and what would be right.
+    """
     try:
         values = tomllib.loads(text)
         legs = values.get("legs")

@@ -105,8 +105,13 @@ def inverse_weights(
 
     What `mj_setConst` computes: the mean diagonal of J M^-1 J^T at qpos0, of the centre of
     mass for bodies, of the joint's own directions for dofs. At qpos0 all frames are aligned
-    with the world's. The trunk's mass is in kg, its centre of mass in m in its frame, its
-    principal inertia in kg m^2.
+    with the world's.
+
+    Args:
+      scene: the nominal model.
+      mass: of the trunk, kg.
+      centre: its centre of mass in its frame, m.
+      inertia: its principal inertia, kg m^2.
     """
     model, trunk, xp = scene.model, scene.trunk, mass.__array_namespace__()
     rest = _at_rest(model, trunk)

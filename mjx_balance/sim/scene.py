@@ -75,8 +75,13 @@ class Scene(Layout):
 def build_model(task: TaskConfig, robot_source: str, visual: bool = False) -> mujoco.MjModel:
     """Assembles and compiles stage, board and robot.
 
-    Without visual geoms MJX has a sixth of the geoms to move. Raises `ConfigError` if the robot's
-    file asks for a board that its feet do not fit on.
+    Args:
+      task: time step and standing height.
+      robot_source: as `Config.robot`.
+      visual: whether to keep the visual geoms; without them MJX has a sixth of the geoms to move.
+
+    Raises:
+      ConfigError: if the robot's file asks for a board that its feet do not fit on.
     """
     robot = find_robot(robot_source)
     stage = mujoco.MjSpec.from_file(str(scene_dir() / "scene.xml"))
@@ -137,7 +142,11 @@ def _board(robot: Robot, size: float | None) -> mujoco.MjSpec:
 
 
 def load_scene(config: Config, visual: bool = False) -> Scene:
-    """Builds the scene and settles the robot; raises `ConfigError` if it does not stand."""
+    """Builds the model, looks its addresses up and settles the robot.
+
+    Raises:
+      ConfigError: if the config contradicts its robot, or the robot does not come to rest upright.
+    """
     robot = find_robot(config.robot)
     check_robot(config, robot)
     model = build_model(config.task, config.robot, visual)
@@ -248,7 +257,14 @@ _HASHED_OPTIONS = (
 
 
 def scene_hash(model: mujoco.MjModel) -> str:
-    """Hashes what the dynamics depend on, to six significant digits: 16 hexadecimal digits."""
+    """Hashes what the dynamics depend on, the solver included, to six significant digits.
+
+    Args:
+      model: with or without its visual geoms; both give the same hash.
+
+    Returns:
+      16 hexadecimal digits.
+    """
     digest = hashlib.sha256()
     touching = np.r_[model.pair_geom1, model.pair_geom2]
     parts = [getattr(model, name) for name in _HASHED]

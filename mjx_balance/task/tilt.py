@@ -54,7 +54,13 @@ def disc_targets(
     direction: Float[Array, "*batch"],
     magnitude: Float[Array, "*batch"],
 ) -> Float[Array, "*batch 2"]:
-    """Targets of up to `incline` deg; direction and magnitude are shares, [0, 1) (paper 3.1)."""
+    """Targets in any direction, deg about X and Y (paper 3.1).
+
+    Args:
+      incline: greatest total tilt, deg.
+      direction: share of a full turn, [0, 1).
+      magnitude: share of the greatest incline, [0, 1).
+    """
     xp = direction.__array_namespace__()
     angle = 2 * np.pi * direction
     unit = xp.stack((xp.cos(angle), xp.sin(angle)), axis=-1)
@@ -66,8 +72,12 @@ def draw_scenario(
 ) -> Scenario:
     """Draws one scenario of training, long enough for an episode.
 
-    The random phase keeps thousands of boards from turning at the same time. `uniform` maps (shape,
-    low, high) to new random numbers in [low, high); its calls always come in the same order.
+    The random phase keeps thousands of boards from turning at the same time.
+
+    Args:
+      task: inclines, the share of the square, the board's speed, the episode's length.
+      uniform: (shape, low, high) -> new random numbers in [low, high); the four calls always come
+        in the same order.
     """
     count = num_targets(task, task.episode_length * task.ctrl_dt)
     direction, magnitude = uniform((2, count), 0.0, 1.0)

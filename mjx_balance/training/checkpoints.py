@@ -61,10 +61,18 @@ def save(directory: Path, env_steps: int, state: object, processes: Processes = 
 def restore(
     directory: Path, like: T, log_fn: Callable[[str], None], processes: Processes = ALONE
 ) -> T | None:
-    """Reads the newest checkpoint that is whole, into a state like `like`; None if none was saved.
+    """Reads the newest checkpoint that is whole; None if none was ever saved.
 
     Damaged ones are logged, and removed if an older one is whole: the run will come by there again.
-    Raises `CheckpointError` if there are checkpoints, but none is whole.
+
+    Args:
+      directory: of all checkpoints of a run.
+      like: a state of the same structure, shapes, dtypes and shardings.
+      log_fn: takes a line for the user.
+      processes: that share the state, as many as they now are.
+
+    Raises:
+      CheckpointError: if there are checkpoints, but none is whole.
     """
     steps = processes.broadcast(lambda: saved_steps(directory))
     for k, step in reversed(list(enumerate(steps))):

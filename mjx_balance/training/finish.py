@@ -39,8 +39,15 @@ def export(run: Run, state: TrainState, seconds: float) -> list[Policy]:
     """Writes a policy per seed; the first also as the run's, until a better one is known.
 
     A seed's policy is that of the state or, if `config.export` says so, the one that validated
-    best so far. Seeds whose weights are no policy are logged and left out; `PolicyError` if all
-    are. `seconds` were spent learning.
+    best so far. Seeds whose weights are no policy are logged and left out.
+
+    Args:
+      run: says which policies.
+      state: of all seeds.
+      seconds: spent learning.
+
+    Raises:
+      PolicyError: if no seed has a policy.
     """
     policies = []
     for weights, manifest in exports(run.config, run.learner, run.env.scene.hash, state):

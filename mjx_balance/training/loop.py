@@ -216,8 +216,11 @@ def measured(
 ) -> tuple[dict[str, float], dict[str, list[float | None]]]:
     """The metrics of a call under their logged names: the `means` of all, and some `listed`.
 
-    `raw` holds means over the call's decisions, () or (num_seeds,); NaN without a value, as the
-    loss before the first update. The call took `seconds`.
+    Args:
+      run: whose env and learner say how their metrics are logged.
+      raw: means over the call's decisions, () or (num_seeds,); NaN without a value, as the loss
+        before the first update.
+      seconds: duration of the call.
     """
     rows = LEARNER_METRICS | dict(run.env.metrics)
     scale = {"decision": 1.0, "minute": 60 / run.config.task.ctrl_dt, "call": run.per_call}

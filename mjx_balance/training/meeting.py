@@ -34,8 +34,14 @@ class ProcessError(InputError):
 def host(address: tuple[str, int], count: int, about: Any, patience_s: float) -> Meeting:
     """Waits, as process 0 of `count`, for all others; listens at this IP and port alone.
 
-    All get to know `about`, a JSON value. Raises `ProcessError` in every process that has come, if
-    another does not come in `patience_s`, or counts differently.
+    Args:
+      address: IP and port.
+      count: number of processes.
+      about: JSON value that all get to know of this one.
+      patience_s: longest time to wait, s.
+
+    Raises:
+      ProcessError: in every process that has come, if another does not, or counts differently.
     """
     where, until = f"{address[0]} port {address[1]}", time.monotonic() + patience_s
     connections: dict[int, socket.socket] = {}

@@ -39,7 +39,11 @@ class Cluster(NamedTuple):
 
 
 def find_cluster(address: str | None, process_id: int | None, count: int | None) -> Cluster:
-    """Places this process by flags, or JAX's detection for None; raises `ProcessError`."""
+    """The place of this process by flags and, for those that are None, by what JAX detects.
+
+    Raises:
+      ProcessError: for an impossible flag, or if Slurm, Open MPI and Kubernetes do not fill it in.
+    """
     flags = {"--coordinator": address, "--process-id": process_id, "--num-processes": count}
     missing, devices = [name for name, value in flags.items() if value is None], None
     if missing:
@@ -67,7 +71,11 @@ def find_cluster(address: str | None, process_id: int | None, count: int | None)
 
 
 def resolve(address: str) -> tuple[str, int]:
-    """IP and port of HOST:PORT or [IPv6]:PORT; raises `ProcessError` for anything else."""
+    """IP and port of HOST:PORT or [IPv6]:PORT.
+
+    Raises:
+      ProcessError: if it is neither, or the host is unknown.
+    """
     name, _, port = address.rpartition(":")
     if not name or not port.isascii() or not port.isdigit() or not 0 < int(port) < 2**16:
         raise ProcessError(f"coordinator is {address!r}; it must be HOST:PORT of process 0")
@@ -127,7 +135,11 @@ class Processes:
         return cast(T, self.gather(value)[0])
 
     def check_same(self, values: Mapping[str, Any]) -> None:
-        """Raises `ProcessError` in all processes if one was started with other JSON values."""
+        """Compares the JSON values that the processes were started with.
+
+        Raises:
+          ProcessError: in all of them, naming the first value that differs.
+        """
         own, *others = self.gather(dict(values))
         for k, theirs in enumerate(others, 1):
             for name, value in own.items():
@@ -157,8 +169,10 @@ ALONE = Processes()  #: a run of one process
 def joined(cluster: Cluster | None) -> Iterator[Processes]:
     """This process among all others of the run; alone without a cluster. Before JAX is used.
 
-    All processes raise an `InputError` or `Interrupted` together: nobody is missed then. Raises
-    `ProcessError` if not all come in time, or they do not fit together.
+    All processes raise an `InputError` or `Interrupted` together: nobody is missed then.
+
+    Raises:
+      ProcessError: if not all come in time, or they do not fit together.
     """
     if cluster is None or cluster.num_processes == 1:
         yield ALONE
@@ -220,7 +234,12 @@ def _free_address(ip: str) -> str:
 def share_machine(everyone: Sequence[Mapping[str, Any]], index: int) -> int:
     """Binds processes that may use the same cores of one machine to cores of their own each.
 
-    `everyone` has `machine` and `cores` of each. Returns the least number of cores of a process.
+    Args:
+      everyone: `machine` and `cores` of every process.
+      index: of this process.
+
+    Returns:
+      Least number of cores of a process.
     """
     places = [(own["machine"], own["cores"]) for own in everyone]
     shares = []

@@ -87,7 +87,12 @@ def scopes(program: str) -> dict[str, str]:
 
 
 def shares(folder: Path, belongs: Mapping[str, str]) -> dict[str, float]:
-    """Shares by scope of a traced call's time on its first device, the largest first; sum 1."""
+    """Shares of a traced call's time on its first device, the largest first; their sum is 1.
+
+    Args:
+      folder: with the trace.
+      belongs: from `scopes`.
+    """
     timelines = list(_timelines(folder))
     events = [event for timeline in timelines for event in timeline]
     if not events:

@@ -99,7 +99,10 @@ def traced_code(config: Config, root: str) -> list[tuple[str, str]]:
 def program_key(config: Config, iterations: int, root: str) -> str:
     """Fingerprint of a training program: equal for equal programs, whatever is around them.
 
-    `root` is the module that builds the program; it and its imports are traced.
+    Args:
+      config: of the run.
+      iterations: decisions of every env per call.
+      root: module that builds the program; it and its imports are traced.
     """
     values = {k: v for k, v in to_dict(config).items() if k not in NOT_TRACED}
     devices = [(device.platform, device.device_kind) for device in jax.devices()]
@@ -135,8 +138,12 @@ def compile_program(
 ) -> CompiledProgram:
     """Compiles a jitted `state -> (state, output)`, from the cache where it can.
 
-    It is traced only if the cache does not know `key`; None: it works in this process alone. The
-    state that it returns has the structure of its argument, whose buffers are donated.
+    Args:
+      program: jitted; traced only if the cache does not know `key`. The state it returns has the
+        structure of its argument, whose buffers are donated.
+      state: an example, on its devices.
+      key: from `program_key`; None for a program that works in this process alone.
+      log_fn: takes what is wrong with the cache.
     """
     leaves, structure = jax.tree.flatten(state)
 

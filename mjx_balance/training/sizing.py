@@ -37,7 +37,11 @@ updates, each with more transitions: the replay ratio stays."""
 
 
 def configure_jax(log_fn: LogFn, num_cores: int | None = None) -> None:
-    """Makes CPU cores (None: all) JAX devices, as many in each process; turns the cache on."""
+    """Makes CPU cores (None: all of this process) JAX devices; turns the compilation cache on.
+
+    Raises:
+      ConfigError: if not all processes have the same number of devices.
+    """
     # Too late if JAX is already in use, as in a notebook: its devices do as they are.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", num_cores or cores())
@@ -53,7 +57,9 @@ def configure_jax(log_fn: LogFn, num_cores: int | None = None) -> None:
 def size_to_device(config: Config, most: int | None = None) -> Config:
     """Fills in `num_envs`, at most `most`, and `num_devices` if they are None.
 
-    Raises `ConfigError` if config, engine and devices do not fit together.
+    Raises:
+      ConfigError: if the config is invalid, its engine does not run here, or the envs cannot be
+        spread over the devices.
     """
     device, num_envs = jax.devices()[0], check(config).num_envs
     check_platform(config.engine, device.platform, device.device_kind)
@@ -115,7 +121,12 @@ def describe_growth(config: Config, sized: Config) -> str:
 
 
 def remember_envs(engine: str, rates: Mapping[int, float]) -> int:
-    """Saves and returns the fewest envs that come near the best of `rates`, for this device."""
+    """Saves the number of envs for runs on this device: the fewest that come near the best rate.
+
+    Args:
+      engine: of the measurement.
+      rates: number of envs -> physics steps per second.
+    """
     enough = NEAR_BEST * max(rates.values())
     chosen = min(num_envs for num_envs, rate in rates.items() if rate >= enough)
     sizes = _measured_sizes() | {_device(engine): chosen}

@@ -57,7 +57,11 @@ def exports(
 
 
 def validate(run: Run, state: TrainState) -> dict[str, np.ndarray]:
-    """Validates and saves every policy; (num_seeds,) per name of `scalars`, NaN if it is none."""
+    """Validates and saves every seed's greedy policy; changes nothing of the state.
+
+    Returns:
+      (num_seeds,) of each of the names of `scalars`; NaN for a seed whose weights are no policy.
+    """
     rows = [
         _validate(run, weights, manifest)
         for weights, manifest in exports(run.config, run.learner, run.env.scene.hash, state)

@@ -56,9 +56,12 @@ ENGINES = {
 
 
 def make_engine(config: Config, scene: Scene) -> "JaxEngine":
-    """Imports and makes the config's engine; raises `ConfigError` if it is not installed.
+    """The config's engine; only that one is imported.
 
     Cheap: a run whose program is cached never asks for the physics of its own process.
+
+    Raises:
+      ConfigError: if the engine is not installed.
     """
     row = ENGINES[config.engine]
     if row.module is not None and importlib.util.find_spec(row.module) is None:
