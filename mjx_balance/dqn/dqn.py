@@ -62,8 +62,10 @@ class DQNSpec:
     devices: Sequence[Any] = dataclasses.field(default_factory=jax.devices)  #: the mesh
     num_seeds: int = 1  #: independent runs in one program
     symmetries: Symmetries | None = None  #: reflections of the env, for `config.mirror`
-    action_factors: tuple[int, ...] | None = None  #: levels of each digit of an action; None: one
-    first_reset: Callable[[jax.Array], State] | None = None  #: an env at the start
+    action_factors: tuple[int, ...] | None = None
+    """Levels of each digit of an action index, for the exploration noise; None: one digit."""
+    first_reset: Callable[[jax.Array], State] | None = None
+    """PRNG key -> an env at the start of a run; None: `Env.reset`."""
     sweep: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
     """Field of `config` -> its value in every run."""
 
@@ -120,10 +122,13 @@ class UpdateState(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class DQN:
-    """Trains a Q-network on an unbatched brax env with `action_size` discrete actions.
+    """Trains a Q-network on a brax env.
 
-    `info["truncation"]`, if there, marks time-outs. The network maps (..., obs_size) to (...,
-    action_size).
+    Args:
+      env: unbatched, with `action_size` discrete actions; `info["truncation"]`, if there,
+        marks time-outs.
+      network: maps (..., obs_size) to (..., action_size).
+      spec: the numbers of the run.
     """
 
     env: Env

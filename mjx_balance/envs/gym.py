@@ -62,11 +62,19 @@ class _Balance:
     ):
         """Builds the scene.
 
-        A preset, "default" if none, is made for the robot, ours if none; a config replaces both.
-        `action` is "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
-        `action_max`, -1 to 1. `render_mode` is "human", a window in which every decision takes its
-        time (of one env), "rgb_array" or None. Raises `ConfigError` for an unknown preset, robot or
-        kind of action, or a config that cannot be run; `UnsupportedMode` for another render mode.
+        Args:
+          preset: name of the config; "default" if neither is given.
+          config: instead of preset and robot; its task, robot and randomisation count.
+          action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
+            `action_max`, -1 to 1.
+          render_mode: "human", a window in which every decision takes its time (one env only);
+            "rgb_array"; or None.
+          robot: as `Config.robot`, for which the preset is adapted; our own if None.
+
+        Raises:
+          ConfigError: for an unknown preset, robot or kind of action, or a config that cannot be
+            run.
+          UnsupportedMode: for another render mode.
         """
         known = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in known:
