@@ -55,6 +55,7 @@ def test_training_ends_in_good_values(make: Callable[..., DQN]) -> None:
     assert abs(float(metrics["reward"])) < 1
 
 
+@pytest.mark.slow
 def test_numbers_too_great_to_be_squared_spoil_neither_statistics_nor_parameters(
     make: Callable[..., DQN],
 ) -> None:

@@ -46,13 +46,11 @@ def noisy(make_dqn: Make) -> tuple[DQN, Any, Any]:
     return dqn, program, program(dqn.init(0))[0]
 
 
+@pytest.mark.slow  # test_reference.py has the same targets, number by number
 @pytest.mark.parametrize(
     ("env", "expected", "changes"),
     [
-        pytest.param(
-            *(probes.TwoSteps(), {1.0: (0.5, 0.5), 2.0: (1.0, 1.0)}, {"double": True}),
-            marks=pytest.mark.slow,  # test_reference.py has the same targets, number by number
-        ),
+        (probes.TwoSteps(), {1.0: (0.5, 0.5), 2.0: (1.0, 1.0)}, {"double": True}),
         (probes.NoTimeLimit(), {-0.6: (0.6, -0.6), 0.5: (-0.5, 0.5)}, {"whiten_steps": 800}),
     ],
     ids=("TwoSteps", "NoTimeLimit"),
@@ -70,6 +68,7 @@ def test_learns_known_values(
     assert float(state.statistics.batches) == (100 if changes.get("whiten_steps") else 0)
 
 
+@pytest.mark.slow
 def test_mirror_teaches_unseen_states(make_dqn: Make) -> None:
     """Only positive observations are shown; the values of negative ones are learnt too."""
     dqn = make_dqn(probes.PositiveState(), mirror=True, symmetries=probes.PositiveState.symmetries)
@@ -198,6 +197,7 @@ SWEPT = {
 """None of them is what the probes' config has; without a delta, errors are squared: 1e9."""
 
 
+@pytest.mark.slow
 def test_a_sweep_is_as_many_runs_with_values_of_their_own(make_dqn: Make) -> None:
     """Runs of one seed: the last has all values, each other one lacks one of them.
 

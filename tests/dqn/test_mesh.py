@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from fixtures import probes
 from jax.sharding import PartitionSpec
 
@@ -46,6 +47,7 @@ def learnt(devices: int) -> list[np.ndarray]:
     return jax.tree.leaves(jax.device_get(jax.jit(shared)(rows)))
 
 
+@pytest.mark.slow
 def test_a_batch_makes_the_same_updates_on_one_device_and_on_two() -> None:
     """Only the order of sums differs: by 1e-6 of the size after 50 updates."""
     one = learnt(1)

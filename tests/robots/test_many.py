@@ -23,6 +23,7 @@ def fleet() -> Any:
     return runpy.run_path(str(EXAMPLE))["Fleet"]([for_robot(base, x) for x in ROBOTS])
 
 
+@pytest.mark.slow
 def test_each_robot_has_its_share_of_the_boards(fleet: Any) -> None:
     """Of 6 boards, 3 do what a `BalanceEnv` of Go1 does, the others what ours does."""
     keys = jax.random.split(jax.random.PRNGKey(3), 6)
