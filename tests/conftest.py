@@ -22,7 +22,7 @@ pytest_plugins = ("fixtures.bodies", "fixtures.fleet")
 
 jax.config.update("jax_num_cpu_devices", 2)
 # The suite compiles longer than it computes. XLA reads this when its first device is asked for.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 
 FLEET = (

@@ -58,7 +58,7 @@ ENGINE_KEYS = {
 CONTENDER_KEYS = {"contender", "engine", "start", "seconds", "decisions", "paper", "corner"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("command", SMALLEST)
 def test_it_runs(command: str, tmp_path: Path) -> None:
     for word, package in NEEDS.items():
