@@ -15,14 +15,14 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from mjx_balance.errors import FAILED, INTERRUPTED, InputError
+from mjx_balance.errors import FAILED, INTERRUPTED
 from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.machine import core_ids
 from mjx_balance.training.meeting import ProcessError, Watch, host, listen, visit
 
 T = TypeVar("T")
 
-PATIENCE_S = 300  #: in which all processes must come, s, as in `jax.distributed`
+PATIENCE_S = 300  #: time limit for all processes to connect, s, as in `jax.distributed`
 
 
 class Interrupted(Exception):
@@ -166,10 +166,13 @@ ALONE = Processes()  #: a run of one process
 
 
 @contextlib.contextmanager
-def joined(cluster: Cluster | None) -> Iterator[Processes]:
+def joined(
+    cluster: Cluster | None, shared: tuple[type[Exception], ...] = ()
+) -> Iterator[Processes]:
     """This process among all others of the run; alone without a cluster. Before JAX is used.
 
-    All processes raise an `InputError` or `Interrupted` together: nobody is missed then.
+    All processes raise a `ProcessError`, `Interrupted` or one of `shared` together, and all leave.
+    With any other error this process exits at once, and the others report it lost.
 
     Raises:
       ProcessError: if not all come in time, or they do not fit together.
@@ -180,7 +183,7 @@ def joined(cluster: Cluster | None) -> Iterator[Processes]:
     processes = _connect(cluster)
     try:
         yield processes
-    except (InputError, Interrupted):
+    except (ProcessError, Interrupted, *shared):
         processes.leave()
         raise
     except BaseException as error:

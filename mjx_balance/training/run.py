@@ -23,6 +23,9 @@ from mjx_balance.training.loop import Interrupts, Program, Run, learn, number
 from mjx_balance.training.processes import Cluster, Interrupted, joined
 from mjx_balance.training.validation import validate
 
+SHARED = (ConfigError, RunFolderError, checkpoints.CheckpointError, PolicyError)
+"""Errors that all processes of a run raise together."""
+
 
 def train(
     config: Config,
@@ -43,7 +46,7 @@ def train(
     used, `PolicyError` if no seed learnt finite numbers, `Interrupted` if the user stopped the run.
     """
     start_time = time.perf_counter()
-    with joined(cluster) as processes:
+    with joined(cluster, SHARED) as processes:
         sizing.configure_jax(display.say, processes.cores)
         sized, env, learner = processes.run_on_all(lambda: _set_up(config), ConfigError)
         if growth := sizing.describe_growth(config, sized):

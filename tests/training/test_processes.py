@@ -2,6 +2,7 @@
 
 import os
 import threading
+import types
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mjx_balance.config import ConfigError
+from mjx_balance.evaluation.rollout import EvaluationError
 from mjx_balance.machine import core_ids, cores
 from mjx_balance.training import processes
 from mjx_balance.training.meeting import ProcessError
@@ -110,6 +113,24 @@ def test_what_differs_is_named_by_all(together: Together) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux binds processes to cores")
+@pytest.mark.parametrize("error", [ProcessError("x"), ConfigError("x"), EvaluationError("x")])
+def test_only_what_all_raise_lets_all_leave(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What one process alone raises ends it: the others wait for it, and see it gone."""
+    steps: list[Any] = []
+    stub = types.SimpleNamespace(leave=lambda: steps.append("leave"))
+    monkeypatch.setattr(processes, "_connect", lambda cluster: stub)
+    monkeypatch.setattr(processes, "time", types.SimpleNamespace(sleep=lambda seconds: None))
+    register = types.SimpleNamespace(register=lambda function, code: steps.append(function))
+    monkeypatch.setattr(processes, "atexit", register)
+    cluster = processes.Cluster("localhost:1", 2, 0)
+    with pytest.raises(type(error)), processes.joined(cluster, (ConfigError,)):
+        raise error
+    alone = isinstance(error, EvaluationError)
+    assert steps == ([processes.exit_at_once] if alone else ["leave"])
+
+
 def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that may use the same ones; whoever was bound already stays where it is."""
     bound: list[Sequence[int]] = []
