@@ -50,11 +50,11 @@ def write(path: Path, scene: Scene, qpos: np.ndarray) -> None:
     Raises:
       RenderError: if no OpenGL backend works here, or the file cannot be written.
     """
-    import imageio.v2 as imageio
-
     is_picture, stride = path.suffix == ".png", frame_stride(scene.task)
     painter = Painter(scene, PICTURE_SIZE if is_picture else VIDEO_SIZE)
     try:
+        import imageio.v2 as imageio
+
         with contextlib.closing(painter), tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / f"drawn{path.suffix}"
             if is_picture:
@@ -65,8 +65,10 @@ def write(path: Path, scene: Scene, qpos: np.ndarray) -> None:
                     for state in qpos[::stride]:
                         writer.append_data(painter.draw(state))
             write_atomically(path, file.read_bytes())
-    except OSError as error:
-        reason = error.strerror or shorten(error, MESSAGE)
+    except RenderError:
+        raise
+    except (OSError, RuntimeError, ValueError, ImportError) as error:  # imageio's own, too
+        reason = getattr(error, "strerror", None) or shorten(error, MESSAGE)
         raise RenderError(f"{path} cannot be written: {reason}") from error
 
 

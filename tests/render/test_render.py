@@ -99,6 +99,18 @@ def test_a_file_that_cannot_be_written_is_no_matter_of_opengl(
     assert (tmp_path / "old.png").read_text() == "old"
 
 
+@pytest.mark.usefixtures("grey")
+def test_no_ffmpeg_gives_one_sentence(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(*arguments: object, **options: object) -> None:
+        raise RuntimeError("No ffmpeg exe could be found.")
+
+    monkeypatch.setattr(imageio, "get_writer", missing)
+    with pytest.raises(RenderError, match=r"never.mp4 cannot be written: No ffmpeg exe could"):
+        write(tmp_path / "never.mp4", scene, np.asarray([[7.0]]))
+
+
 def test_macos_wants_mjpython(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     reason = "`launch_passive` requires that the Python script be run under `mjpython` on macOS"
 
