@@ -61,20 +61,22 @@ def write_atomically(path: Path, content: str | bytes) -> None:
       OSError: if it cannot be written; the old content then stays.
     """
     data = content.encode() if isinstance(content, str) else content
-    target = path.resolve()
-    part = target.with_name(f"{target.name}.part")
+    part = None
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             path.write_bytes(data)
             return
+        target = path.resolve()
+        part = target.with_name(f"{target.name}.part")
         with part.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         part.replace(target)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
+        if part is not None:
+            with contextlib.suppress(OSError):
+                part.unlink()
         error.filename = str(path)  # the user knows no .part file
         raise
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import hypothesis.strategies as st
 import pytest
@@ -65,7 +66,9 @@ def test_a_file_is_replaced_only_once_the_new_one_is_on_disk(
     assert file.read_bytes() == b"\0\xff"
 
 
-def test_links_are_followed_and_pipes_written_to(tmp_path: Path) -> None:
+def test_links_are_followed_and_pipes_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Neither is replaced: what they stand for is somewhere else."""
     (tmp_path / "there").mkdir()
     file, link, pipe = (tmp_path / name for name in ("there/file", "link", "pipe"))
@@ -85,6 +88,11 @@ def test_links_are_followed_and_pipes_written_to(tmp_path: Path) -> None:
         write_atomically(tmp_path / "there", "x")
     assert error.value.filename == str(tmp_path / "there")
     assert sorted(os.listdir(tmp_path)) == ["link", "pipe", "there"]
+    (tmp_path / "pipe.part").touch()  # somebody else's
+    monkeypatch.setattr(Path, "write_bytes", mock.Mock(side_effect=OSError(32, "Broken pipe")))
+    with pytest.raises(OSError, match="Broken pipe"):
+        write_atomically(pipe, "x")
+    assert (tmp_path / "pipe.part").exists()
 
 
 def test_a_new_folder_has_config_and_provenance_and_nothing_beside_it(folder: RunFolder) -> None:
