@@ -109,6 +109,13 @@ def load(name: str, monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     return module
 
 
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_it_can_be_imported(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if script.stem in NEEDS:
+        pytest.importorskip(NEEDS[script.stem])
+    load(script.stem, monkeypatch)
+
+
 def test_every_table_of_the_pages_has_a_script(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its markers name the script, and what stands between them is one of its tables."""
     pages = [*BENCHMARKS.glob("*.md"), *REPO.glob("*.md"), *(REPO / "docs").glob("*.md")]

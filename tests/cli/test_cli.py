@@ -16,9 +16,10 @@ from mjx_balance.cli import evaluate, main
 from mjx_balance.cli.common import ControllerArgs
 from mjx_balance.config import ConfigError, preset, to_dict
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.evaluation.rollout import run_suite, summarize
+from mjx_balance.evaluation.controllers import make_controller
+from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked, write_json
-from mjx_balance.policy.file import PolicyError
+from mjx_balance.policy.file import PolicyError, load_policy
 from mjx_balance.render.drawing import VIDEO_SIZE
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.scene import load_scene, scene_dir
@@ -236,13 +237,14 @@ def test_evaluate_writes_figures_and_a_video(
     who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, read_video: Any
 ) -> None:
     """0.4 s of a baseline and of a policy, to the end of the command."""
-    args: Any = {"controller": "pd-imu"} if who == "controller" else {"policy": SHIPPED}
     names = ("--controller", "pd-imu") if who == "controller" else (str(SHIPPED),)
     flags = "--suite corner --scenarios 2 --duration 0.4 --seed 5 --json out.json --video v.mp4"
     code = main(("evaluate", *names, *flags.split()))
     said = capsys.readouterr()
     result = json.loads((tmp_path / "out.json").read_text())
-    rollout = run_suite(*ControllerArgs(**args).load(), "corner", 2, 0.4, 5)
+    scene = load_scene(preset("default" if who == "controller" else "best"))
+    ours = observing(load_policy(SHIPPED)) if who == "policy" else make_controller("pd-imu", scene)
+    rollout = run_suite(scene, ours, "corner", 2, 0.4, 5)
     expected = summarize(rollout, "corner", 0.4, 5)
     speeds = [found.pop("physics_steps_per_second") for found in (result, expected)]
     assert result == expected
@@ -331,6 +333,17 @@ def test_a_full_disk_leaves_no_half_robot(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("full_disk")
+def test_a_full_disk_leaves_the_old_onnx_file(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    pytest.importorskip("onnx")
+    Path("p.onnx").write_text("old")
+    said = refuse(capsys, "export", str(SHIPPED), "--out", "p.onnx")
+    assert "cannot write p.onnx: No space left on device" in said
+    assert [(x.name, x.read_text()) for x in tmp_path.iterdir()] == [("p.onnx", "old")]
+
+
 @pytest.mark.slow
 def test_a_robots_draft_can_be_checked(capsys: pytest.CaptureFixture[str]) -> None:
     """With too weak a knee it stands on the level board, and is drawn on the tilted one."""
@@ -408,7 +421,7 @@ def test_view_shows_a_policy_by_name(window: Callable[[str], StubWindow]) -> Non
 
 def test_view_shows_the_scenario_of_a_suite_and_seed(window: Callable[[str], StubWindow]) -> None:
     corner = window("--controller none --suite corner --seed 3")
-    scene, controller = ControllerArgs(controller="none").load()
-    rollout = run_suite(scene, controller, "corner", 1, 0.6, 3, record=True)
+    scene = load_scene(preset("default"))
+    rollout = run_suite(scene, make_controller("none", scene), "corner", 1, 0.6, 3, record=True)
     np.testing.assert_allclose(np.concatenate(corner.shown), rollout.qpos[0], atol=1e-9)
     assert {texts[1][1] for texts in corner.said} == {"Enter: push"}

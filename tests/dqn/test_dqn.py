@@ -77,12 +77,17 @@ def test_mirror_teaches_unseen_states(make_dqn: Make) -> None:
     assert np.asarray(state.replay.data.obs).min() >= 0
 
 
-def test_symmetries_are_used_only_with_mirror(make_dqn: Make) -> None:
-    class Unused:
-        """Fails the test if it is asked for anything."""
-
-    dqn = make_dqn(probes.PositiveState(), symmetries=Unused())
+@pytest.mark.parametrize("mirror", [False, True])
+def test_symmetries_are_used_only_with_mirror(
+    mirror: bool, monkeypatch: pytest.MonkeyPatch, make_dqn: Make
+) -> None:
+    used: list[Any] = []
+    monkeypatch.setattr(replay, "reflect", lambda batch, group, key: used.append(group) or batch)
+    group = probes.PositiveState.symmetries
+    dqn = make_dqn(probes.PositiveState(), mirror=mirror, symmetries=group)
     jax.eval_shape(dqn.train_program(2), jax.eval_shape(lambda: dqn.init(0)))
+    assert bool(used) == mirror
+    assert all(x is group for x in used)
 
 
 def test_each_device_samples_its_own_share_of_every_batch(
@@ -155,12 +160,16 @@ def test_the_state_is_everything(noisy: tuple[DQN, Any, Any], make_dqn: Make) ->
 
 
 def test_several_seeds_are_as_many_runs(noisy: tuple[DQN, Any, Any], make_dqn: Make) -> None:
-    """One program of three seeds learns what three programs learn."""
+    """One program of three seeds learns what three programs learn; the last has another rate."""
     single, program, _ = noisy
-    dqn = make_dqn(probes.NoisyState(), num_seeds=3)
+    rates = (CONFIG.learning_rate, CONFIG.learning_rate, 10 * CONFIG.learning_rate)
+    dqn = make_dqn(probes.NoisyState(), num_seeds=3, sweep={"learning_rate": rates})
     three_runs = dqn.train_program(10)
     state, metrics = jax.device_get(three_runs(dqn.init(5)))
-    for k in range(3):
+    slower = jax.device_get(program(single.init(7))[0].params)
+    pairs = zip(jax.tree.leaves(state.params), jax.tree.leaves(slower), strict=True)
+    assert max(np.abs(a[2] - b).max() for a, b in pairs) > 1e-3
+    for k in range(2):
         alone, alone_metrics = jax.device_get(program(single.init(5 + k)))
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a[k], b, atol=1e-4),  # noqa: B023

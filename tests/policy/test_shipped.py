@@ -6,7 +6,8 @@ import pytest
 
 from mjx_balance import load_policy
 from mjx_balance.config import flatten, preset, to_dict
-from mjx_balance.evaluation.rollout import evaluate, policy_scene
+from mjx_balance.evaluation.controllers import make_controller
+from mjx_balance.evaluation.rollout import evaluate, policy_scene, run_suite
 
 FOLDER = Path(__file__).parents[2] / "policies"
 POLICIES = sorted((*FOLDER.glob("*.safetensors"), *FOLDER.glob("seeds/*.safetensors")))
@@ -22,6 +23,8 @@ def test_there_is_a_best_policy_and_its_seeds() -> None:
     seeds = [load_policy(path) for path in POLICIES if path.name.startswith("seed-")]
     assert best.fingerprint in {policy.fingerprint for policy in seeds}
     assert len({policy.fingerprint for policy in seeds}) == len(seeds) == 5
+    scene = policy_scene(best)  # whoever stands still falls in the scenarios of the tests below
+    assert run_suite(scene, make_controller("none", scene), "corner", 8, 20.0, 11).fell.all()
 
 
 @pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)

@@ -3,7 +3,7 @@
 import pytest
 
 from mjx_balance.evaluation.controllers import make_controller
-from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
+from mjx_balance.evaluation.rollout import evaluate, observing, policy_scene, run_suite
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.policy.file import load_policy, shipped_policies
 from mjx_balance.robots.catalogue import shipped
@@ -13,7 +13,9 @@ MAKERS = tuple(name for name in shipped() if name != "quadruped")
 
 def test_each_robot_has_one() -> None:
     assert set(MAKERS) == set(shipped_policies()) - {"best"}
-    policy_scene(load_policy("go2"))  # fails if the scene has changed
+    result = evaluate(load_policy("go2"), "corner", 2, 5.0, SEEDS.held_out)
+    assert result["falls"] == 0
+    assert result["tilt_deg"]["mean"] < 0.2
 
 
 @pytest.mark.slow

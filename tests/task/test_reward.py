@@ -46,6 +46,9 @@ def test_tilt_near_the_upright_is_good_to_a_ten_thousandth_in_float32(xp: types.
     turn = Rotation.from_euler("ZX", np.stack((rng.uniform(-180, 180, 50), lean), -1), degrees=True)
     quat = turn.as_quat(scalar_first=True).astype(np.float32)
     np.testing.assert_allclose(body_tilt(xp.asarray(quat)), lean, atol=1e-4)
+    lean = np.asarray([1.0, 6.0, 90.0, 179.0])
+    quat = Rotation.from_euler("y", lean[:, None], degrees=True).as_quat(scalar_first=True)
+    np.testing.assert_allclose(body_tilt(xp.asarray(quat, "float32")), lean, rtol=1e-4)
 
 
 @settings(deadline=None, max_examples=200)

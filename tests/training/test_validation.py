@@ -1,17 +1,21 @@
 """Validation during training: what is measured and kept, the best of it, and learning untouched."""
 
 import dataclasses
+import functools
 import random
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from brax.envs.base import Env, State
 
 from mjx_balance import load_policy
 from mjx_balance.config import preset
+from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.suites import SEEDS
 from mjx_balance.files.run_folder import RunFolder
@@ -19,6 +23,7 @@ from mjx_balance.policy.file import save_policy
 from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.sim.scene import Scene
 from mjx_balance.training import finish
+from mjx_balance.training.loop import Interrupts, learn
 from mjx_balance.training.validation import best_validated, scalars, score, validate
 
 CONFIG = preset("smoke")
@@ -169,3 +174,61 @@ def test_each_of_several_seeds_exports_its_own_best(
         assert policy.manifest["training"]["env_steps"] == env_steps
         assert policy.config.seed == SEED + k
     assert folder.policy.read_bytes() == folder.seed_policy(SEED).read_bytes()
+
+
+class Blind(Env):
+    """Random observations of a robot's size; 441 actions, of which the first half pays."""
+
+    action_size, backend, observation_size = 441, "probe", 0  # pyright: ignore
+
+    def __init__(self, size: int):
+        self.size = size
+
+    def reset(self, rng: jax.Array) -> State:
+        zero = jnp.float32(0.0)
+        return State(None, jax.random.normal(rng, (self.size,)), zero, zero, {}, {})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        reward = jnp.float32(action < 220)
+        return state.replace(obs=-jnp.asarray(state.obs), reward=reward, done=jnp.float32(1.0))
+
+
+@pytest.mark.slow
+def test_learning_is_the_same_bit_for_bit_with_and_without_validation(
+    scene: Scene, make_run: Any, stub_learner: Any
+) -> None:
+    """Two seeds on two devices: weights, optimiser, replay, random keys, everything."""
+    dqn = dataclasses.replace(
+        CONFIG.dqn,
+        batch_size=32,
+        replay_ratio=8,
+        min_replay_size=32,
+        mirror=False,
+        whiten_steps=64,
+        hidden_sizes=(8,),
+    )
+    config = dataclasses.replace(
+        SHORT, num_seeds=2, num_envs=16, num_env_steps=192, log_every=64, dqn=dqn
+    )
+    network = QNetwork((8,), (21, 21), radial=True)
+    spec = DQNSpec(dqn, 16, 192, num_seeds=2, action_factors=(21, 21))
+    learner = DQN(Blind(stub_learner.obs_size), network, spec)
+    program: Any = learner.train_program(4)
+
+    def trained(eval_every: int) -> Any:
+        run = make_run(dataclasses.replace(config, eval_every=eval_every), scene)
+        run = dataclasses.replace(run, learner=learner)
+        with Interrupts(pytest.fail) as stop:
+            validated = functools.partial(validate, run)
+            state, _ = learn(run, program, learner.init(3), stop, validated)
+        policies = len(list(run.folder.validated.glob("*/*")))
+        return jax.device_get(state), policies
+
+    (with_, policies), (without, none) = trained(64), trained(0)
+    assert (policies, none) == (3 * 2, 0)
+    assert with_.gradient_steps.tolist() == without.gradient_steps.tolist() != [0, 0]
+    assert program._cache_size() == 1
+    first, second = (jax.tree.leaves_with_path(state) for state in (with_, without))
+    assert len(first) == len(second) > 20
+    for (path, a), (_, b) in zip(first, second, strict=True):
+        assert a.tobytes() == b.tobytes(), path
