@@ -47,7 +47,7 @@ WEIGHT = (0.5 * 9.81, 1.5 * 9.81)  #: norm of the mean acceleration, m/s^2; push
 LEAN_MOST = 40.0  #: greatest angle of it from z, deg; a fall has 6, but a push can look like 29
 AWAY_MOST = 0.5  #: greatest error of a joint at a decision, rad; pushes give 0.03
 KNEE_SLACK = 0.1  #: tolerance of a knee's reading beyond its stops, rad
-LATE_SAMPLES = 5  #: greatest delay of a call or decision, sample periods
+LATE_SAMPLES = 5  #: greatest gap between calls, and error of a decision's length
 
 
 class PolicyFileError(ValueError):

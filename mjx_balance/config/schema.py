@@ -1,7 +1,7 @@
 """The frozen dataclasses of a config: every number with its unit, bounds and source.
 
-No other module repeats these numbers. "paper n" cites a section of the paper; "chosen" marks a
-number that the paper does not give.
+No other module states these numbers again, but for those of our own robot in `robots/`. "paper n"
+cites a section of the paper; "chosen" marks a number that the paper does not give.
 """
 
 import dataclasses

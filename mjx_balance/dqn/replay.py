@@ -23,7 +23,7 @@ class Transition(NamedTuple):
     action: Int[Array, "*rows"]  #: index, int32
     reward: Float[Array, "*rows"]
     terminated: Float[Array, "*rows"]
-    """1 after a termination, else 0, also after a truncation: only the former end bootstrapping."""
+    """1 after a termination; 0 otherwise, also after a truncation, which ends no bootstrapping."""
     next_obs: Float[Array, "*rows obs"]  #: the observation before any reset
 
 

@@ -68,7 +68,7 @@ class BatchEnv:
         """(n, obs_size) of robots that have just been reset."""
 
     def reset(self, ids: Int[np.ndarray, " k"], episodes: Episodes) -> None:
-        """Starts envs `ids` anew with episodes that have what the first ones had."""
+        """Starts envs `ids` anew; episodes have params and pushes if the first ones had."""
         _set_rows(self.state, ids, self._initial(ids, episodes))
         self._engine.reset(ids)
         for k, rng in zip(ids, episodes.rngs, strict=True):
@@ -78,15 +78,16 @@ class BatchEnv:
         still = np.tile(self.scene.stance.imu, (len(ids), 1))
         memory = initial_memory(self.task, self.scene.robot, still)
         env_steps = np.zeros(len(ids), int)
-        state = EnvState(ids, memory, episodes.scenario, env_steps, *episodes[1:3])
+        params, pushes = episodes.params, episodes.pushes
+        state = EnvState(ids, memory, episodes.scenario, env_steps, params, pushes)
         return _tree_map(np.array, state)  # a copy, which may be written to
 
     def step(
         self, change: Float[np.ndarray, "k 2"], ids: Int[np.ndarray, " k"] | None = None
     ) -> Outcome:
         """Takes one decision, in envs `ids` or all; `change` is a_x and a_y of the actions, m."""
-        ids = np.arange(self.num_envs) if ids is None else ids
-        before = rows(self.state, ids)
+        before = self.state if ids is None else rows(self.state, ids)
+        ids = before.physics
         noise, params = None, before.params
         if params is not None and params.imu_noise.any():
             shape = (self.task.sim_steps, params.imu_noise.shape[-1])

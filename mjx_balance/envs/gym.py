@@ -98,14 +98,14 @@ class _Balance:
         self.observation_space = self.single_observation_space = spaces.Box(-most, most)
 
     def _start(self, rngs: Sequence[np.random.Generator], ids: np.ndarray) -> np.ndarray:
-        """Starts an episode from each generator in envs `ids`; returns all first observations."""
+        """Starts an episode from each generator in envs `ids`; returns their first observations."""
         config = self.config
         episodes = draw_episodes(config.task, config.randomization, self.scene.robot, rngs)
         if self.batch is None:
             self.batch = BatchEnv(self.scene, episodes, self.threads)
         else:
             self.batch.reset(ids, episodes)
-        return self.batch.initial_obs.astype(np.float32)
+        return self.batch.initial_obs[ids].astype(np.float32)
 
     def _height_changes(self, action: Any, space: spaces.Space) -> np.ndarray:
         """Height changes (..., 2), m, of an action, or of one per env, that must be in `space`."""
@@ -227,12 +227,20 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
 
-    def __init__(self, num_envs: int = 1, *arguments: Any, **keywords: Any):
+    def __init__(
+        self,
+        num_envs: int = 1,
+        preset: str | None = None,
+        config: Config | None = None,
+        action: str = "discrete",
+        render_mode: str | None = None,
+        robot: str | None = None,
+    ):
         """Builds the scene of `num_envs` envs; the other arguments are those of `BalanceGymEnv`."""
         whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
         if not whole or num_envs < 1:
             raise ConfigError(f"num_envs is {quote(num_envs)}; it must be a whole number above 0")
-        super().__init__(*arguments, **keywords)
+        super().__init__(preset, config, action, render_mode, robot)
         self.num_envs = num_envs
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -283,7 +291,7 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 final[k] = obs[k].copy()
             info |= {"final_obs": final, "_final_obs": done}
             info |= {"final_info": _info(outcome, done), "_final_info": done.copy()}
-            obs[ids] = self._start([self._rngs[k] for k in ids], ids)[ids]
+            obs[ids] = self._start([self._rngs[k] for k in ids], ids)
         return obs, outcome.reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:

@@ -122,6 +122,7 @@ class ImuPD(AttitudePD):
         """Takes the gains; `tau` in s, and the gyro samples averaged for the rate."""
         super().__init__(scene, proportional, rate)
         self.tau, self.samples = tau, samples
+        self.angle = np.zeros((0, ACTION_AXES))
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Filters the last decision's samples; see `AttitudePD.state`."""
@@ -166,6 +167,7 @@ class Predictive:
         tail = np.ones_like(response.course)
         tail[:, :-steps] = response.course[:, steps:]
         self.unfinished = tail - response.course[:, steps - 1 : steps]
+        self.chosen = np.zeros((2, 0, ACTION_AXES))
 
     def __call__(self, view: View) -> np.ndarray:
         """Returns action indices (n,)."""
@@ -176,11 +178,12 @@ class Predictive:
         delayed = view.delayed[:, None]
         ahead = task.sim_dt * np.arange(1, HORIZON * task.sim_steps + 1)
         now = np.full(n, view.env_steps * task.ctrl_dt)
-        board = self.forecast(task, view.scenario, now, ahead) @ (1, 1j)
-        w, x, y, z = view.qpos[:, self.scene.trunk_quat].T
-        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))[:, None]
-        board = board * np.exp(-1j * yaw)  # as the body sees it
-        free = attitude(self.scene, view)[:, None] + np.stack((board.real, board.imag), axis=-1)
+        x, y = np.moveaxis(self.forecast(task, view.scenario, now, ahead), -1, 0)
+        w, i, j, k = view.qpos[:, self.scene.trunk_quat].T
+        yaw = np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))[:, None]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        board = np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)  # in the body's frame
+        free = attitude(self.scene, view)[:, None] + board
         free = free + np.where(delayed, older, newer)[:, None] * self.unfinished.T
         linear = np.einsum("xjt,ntx->nxj", self.effect, free)
         limit = np.abs(self.gain) * task.action_max

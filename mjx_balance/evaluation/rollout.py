@@ -127,7 +127,8 @@ def _record(
     """Writes decision `number` of scenarios `ids` (n,), whose robots stood until then."""
     task, fallen = rollout.task, outcome.terminated
     span = slice(number * task.sim_steps, (number + 1) * task.sim_steps)
-    # Where the simulation diverged, `fail_tilt` stands at every step: none is beyond it.
+    # A diverged decision has `fail_tilt` at every step, so argmax of all False is 0: it counts as
+    # fallen from its start.
     first = failed(task, outcome.tilt).argmax(axis=-1)
     after = fallen[:, None] & (np.arange(task.sim_steps) >= first[:, None])
     rollout.tilt[ids, span] = np.where(after, task.fail_tilt, outcome.tilt)

@@ -15,7 +15,7 @@ from mjx_balance.files.text import quote
 from mjx_balance.policy.manifest import PolicyError, naming, upgrade
 from mjx_balance.policy.network import Policy
 
-MOST_BYTES = 64 * 2**20
+MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
 MOST_MANIFEST = 4 * 2**20  #: greatest size of a manifest, characters
 
 

@@ -78,8 +78,7 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
         ir_version=IR_VERSION,
         opset_imports=[helper.make_opsetid("", OPSET)],
     )
-    parts = {"manifest": policy.manifest, "inputs": policy.manifest["inputs"]}
-    helper.set_model_props(model, {name: json.dumps(value) for name, value in parts.items()})
+    helper.set_model_props(model, {"manifest": json.dumps(policy.manifest)})
     onnx.checker.check_model(model, full_check=True)
     return model
 

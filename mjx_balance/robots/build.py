@@ -19,7 +19,7 @@ from mjx_balance.robots.measure import JOINT_ACTUATORS, check_joints, measure, p
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import Foot, LegFile, RobotError, RobotFile
 
-FRESH = mujoco.MjSpec()  #: MuJoCo's defaults, which its maker's model may have changed
+FRESH = mujoco.MjSpec()  #: MuJoCo's own defaults, for elements that we add to a maker's model
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
 BOARD_SIZE = "board_size"  #: name of the model's numeric element with `RobotFile.board_size`

@@ -12,7 +12,7 @@ from mjx_balance.files.validation import check_types
 from mjx_balance.robots.robot import OUR_LEVER, OUR_MASS, Body, Leg, Robot
 from mjx_balance.robots.schema import LegFile, RobotError, RobotFile
 
-LEVEL = math.cos(math.radians(1.0))  #: greatest angle of a joint's axis to the trunk's
+LEVEL = math.cos(math.radians(1.0))  #: of the greatest angle of a joint's axis to the trunk's
 SLACK = 1e-3  #: tolerance of an abduction's limits, rad
 FREE_KNEE = (0.1, 2.7)  #: bend of a knee without limits, rad: almost straight, on the thigh
 WHOLE_TURNS = [2 * math.pi * k for k in (0, 1, -1, 2, -2)]  #: between the model's angles and ours
@@ -269,7 +269,7 @@ def _level_turns(leg: LegFile, turns: Range) -> float:
 def _bend(
     leg: LegFile, hip: Range, knee: Range, lengths: list[float]
 ) -> tuple[Range, float, float]:
-    """The knee's way: the file's, or backward unless forward has more than twice the range."""
+    """Bends the knee as the file says; else backward, unless forward has twice the range."""
     backward, forward = (_bend_to(side, hip, knee, lengths) for side in (-1, 1))
     if leg.knee is not None:
         bend = forward if leg.knee == "forward" else backward

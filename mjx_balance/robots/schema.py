@@ -75,8 +75,8 @@ class RobotFile:
     body_height: Positive | None = None  #: standing height of the trunk's origin above the board, m
     action_max: Positive | None = None  #: greatest height change of one decision on one axis, m
     board_size: Positive | None = None  #: length of the board in training, m
-    source: str = ""
-    license: str = ""  #: of the model, like `source`
+    source: str = ""  #: where the model is from
+    license: str = ""  #: of the model
 
 
 REMEDIES = {

@@ -44,7 +44,7 @@ class Targets(NamedTuple):
 class Motion(NamedTuple):
     """What an engine measures at every physics step of a decision; NaN where it has diverged."""
 
-    imu: Float[Array, "*batch sim_steps 6"]  #: gyro, accelerometer before each step
+    imu: Float[Array, "*batch sim_steps 6"]  #: rad/s and m/s^2, before each step
     tilt: Float[Array, "*batch sim_steps"]  #: body tilt after each step, deg
     joint_angles: Float[Array, "*batch sim_steps legs 3"]  #: after each step, rad
 

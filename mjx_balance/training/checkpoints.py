@@ -27,7 +27,7 @@ class CheckpointError(InputError):
 
 
 def save(directory: Path, env_steps: int, state: object, processes: Processes = ALONE) -> None:
-    """Writes a checkpoint of a pytree of arrays, unless there is one after so many decisions.
+    """Writes a checkpoint of a pytree of arrays, unless one with these `env_steps` exists.
 
     Every process writes its own part of the state; the first one does the rest. Raises
     `CheckpointError` if it cannot be written; those before it stay.

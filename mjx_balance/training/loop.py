@@ -40,7 +40,8 @@ STOPPING = (
 
 Program = Callable[[TrainState], tuple[TrainState, Mapping[str, jax.Array]]]
 """A compiled call: many decisions of every env, and the means of its metrics."""
-Validate = Callable[[TrainState], Mapping[str, np.ndarray]]  #: by logged name, a value per seed
+Validate = Callable[[TrainState], Mapping[str, np.ndarray]]
+"""State -> logged name -> (num_seeds,) results of its greedy policies."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,7 @@ from mjx_balance.files.text import MESSAGE, shorten
 
 PROGRAM = "mjx_balance"  #: what a process of ours says first, within `HELLO_S`
 HELLO_S, LINE_BYTES, THREADS = 5, 2**16, 100
-"""Longest line that is read; from so many threads on, connections wait to be asked."""
+"""Seconds for a hello; longest line that is read; threads at which more connections wait."""
 KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 4, "TCP_USER_TIMEOUT": 30_000}
 """A machine that answers nothing counts as gone after 30 s."""
 Meeting = tuple[dict[int, socket.socket], list[Any]]

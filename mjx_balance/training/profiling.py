@@ -123,7 +123,7 @@ def _timelines(folder: Path) -> Iterator[list[Event]]:
 
 
 def _own_times(events: list[Event]) -> Iterator[tuple[Event, float]]:
-    """The duration of each event, and again, negative, for the event that it runs within."""
+    """Durations to sum per event: its own, less those of events that run within it."""
     within: list[Event] = []
     for event in sorted(events, key=lambda event: (event.start, -event.duration)):
         while within and event.start >= within[-1].end:

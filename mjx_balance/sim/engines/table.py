@@ -32,8 +32,8 @@ class EngineRow(NamedTuple):
     hardware: str = "every device"  #: the same in words
     cacheable: bool = True  #: whether its traced programs work in another process
     module: str | None = None
-    """What the extra called as the engine brings, hidden from imports while another engine runs;
-    none: the extra `train` is enough."""
+    """Module that the extra of the engine's name installs, hidden while another engine runs; None:
+    the extra `train` is enough."""
     distribution: str | None = None  #: the registry's name of that module
 
 
