@@ -87,14 +87,14 @@ class BatchEnv:
     ) -> Outcome:
         """Takes one decision, in envs `ids` or all; `change` is a_x and a_y of the actions, m."""
         before = self.state if ids is None else rows(self.state, ids)
-        ids = before.physics
+        envs: np.ndarray = before.physics
         noise, params = None, before.params
         if params is not None and params.imu_noise.any():
             shape = (self.task.sim_steps, params.imu_noise.shape[-1])
-            noise = np.stack([self._rngs[k].normal(size=shape) for k in ids])
+            noise = np.stack([self._rngs[k].normal(size=shape) for k in envs])
         after, outcome = step(self.task, self.scene.robot, self._engine, before, change, noise)
-        _set_rows(self.state.memory, ids, after.memory)
-        self.state.env_steps[ids] = after.env_steps
+        _set_rows(self.state.memory, envs, after.memory)
+        self.state.env_steps[envs] = after.env_steps
         return outcome
 
     @property
