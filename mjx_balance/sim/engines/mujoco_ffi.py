@@ -75,8 +75,9 @@ class _Pool:
             engine.set_state(*state)
             motion = engine.roll(np.arange(count), ctrl, params)
             values = (*engine.state(), *motion)
-        for result, value in zip(results, values, strict=True):
-            result.reshape(value.shape)[...] = value
+        with np.errstate(over="ignore"):  # beyond float32, a diverged env's value is inf
+            for result, value in zip(results, values, strict=True):
+                result.reshape(value.shape)[...] = value
 
     @contextmanager
     def _borrowed(self, count: int, params: DomainParams | None) -> Iterator[MujocoEngine]:
