@@ -32,7 +32,7 @@ FLEET = (
     "test_env_randomization",
     "test_stagger",
 )
-"""Files that share the fixture `fleet`, which takes a minute to compile."""
+"""Files that share the fixture `fleet`, which takes a minute to compile over MJX."""
 FIRST = ("test_run", "test_distributed", "test_learning", *FLEET, "dqn", "test_page")
 """Files and folders that begin first, so that the last of several processes is not left alone."""
 

@@ -1,4 +1,4 @@
-"""BalanceEnv in MJX: what an episode consists of, and which way the robot goes."""
+"""BalanceEnv: what an episode consists of, and which way the robot goes."""
 
 import dataclasses
 import itertools

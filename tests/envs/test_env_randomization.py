@@ -1,4 +1,4 @@
-"""Domain randomisation in MJX: what differs from env to env, and by how much."""
+"""Domain randomisation: what differs from env to env, and by how much."""
 
 import dataclasses
 import itertools

@@ -1,4 +1,4 @@
-"""MJX against MuJoCo's C engine, in closed loop, each robot driven by what it sees itself."""
+"""Engines of training against evaluation, in closed loop, each robot driven by what it sees."""
 
 import dataclasses
 import types
@@ -35,7 +35,7 @@ class Course(NamedTuple):
 
 @pytest.fixture(scope="module")
 def courses(fleet: Any, closed_loop: list[Any]) -> tuple[Course, Course]:
-    """Of MJX and of the C engine."""
+    """Of training's engine and of evaluation's."""
     env, before, after = fleet.env, closed_loop[:-1], closed_loop[1:]
     ours = Course(
         np.asarray([s.obs for s in before]),
@@ -171,6 +171,7 @@ def test_mjx_solves_as_the_config_says_and_leaves_the_scene_alone(
         np.testing.assert_allclose(getattr(state, name), stance, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("fleet", [pytest.param("mjx", marks=pytest.mark.slow)], indirect=True)
 def test_matrix_products_of_the_physics_are_exact(fleet: Any) -> None:
     """TF32 would do on a GPU what nobody asked for: all but the observation's are `highest`."""
     products = [line for line in fleet.program.splitlines() if "dot_general" in line]
