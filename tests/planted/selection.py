@@ -7,6 +7,8 @@ from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[2]
 PACKAGE = "mjx_balance"
+CLI = "mjx_balance.cli"
+"""Imports its commands by name; `train.py` starts it."""
 
 
 def parsed(file: Path) -> ast.Module:
@@ -70,7 +72,9 @@ def graph() -> dict[str, set[str]]:
             and names & arguments
             and (other.parent.name == "fixtures" or other.parent in file.parents)
         }
-        edges[str(file)] = set(imported(tree)) | reach
+        starts = any(isinstance(x, ast.Constant) and x.value == "train.py" for x in ast.walk(tree))
+        edges[str(file)] = set(imported(tree)) | reach | ({CLI} if starts else set())
+    edges[CLI] |= {name for name in modules() if name.startswith(f"{CLI}.")}
     return edges
 
 
