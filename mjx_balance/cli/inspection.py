@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.config import check, preset
+from mjx_balance.robots.catalogue import robot_notes
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.robots.measure import UNLIMITED
 from mjx_balance.robots.robot import Leg
@@ -109,6 +110,7 @@ def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
         f"{_limit(robot.hip_torque)} (abduction, hip), {_limit(robot.knee_torque)} (knee)",
         "",
         *map(_leg, robot.legs),
+        *(f"note: {note}" for note in robot_notes(scene.robot_source)),
         "",
         f"height changes up to {1000 * task.action_max:.2f} mm follow {able:.2f} deg/s, "
         f"{able / task.board_rate:.2f} of the board's {task.board_rate:g}",

@@ -42,25 +42,30 @@ def check(robot: Positional[str], picture: Path | None = None) -> int:
     return FAILED if problems else 0
 
 
-def new(model: Positional[str], out: Path | None = None) -> int:
-    """Draft a robot's TOML file from its model.
+def new(model: Positional[str], out: Path | None = None, strip: tuple[str, ...] = ()) -> int:
+    """Draft a robot's TOML file from its model, and say what has to be mended first.
 
     Args:
       model: MJCF or URDF file, PACKAGE:PATH of one in a Python package, or menagerie:NAME.
       out: File to write; none: the terminal.
+      strip: Bodies to leave out, and joints to fix.
     """
-    from mjx_balance.robots.build import model_path
-    from mjx_balance.robots.draft import draft
+    from mjx_balance.robots.draft import sketch
+    from mjx_balance.robots.model import model_path
 
     path = model_path(model, Path())
+    if out is not None:
+        if out.exists():
+            return complain(f"{out} exists already")
+        check_out("out", out)
+        if path == Path(model):
+            model = os.path.relpath(path, out.parent)
+    text, problems = sketch(model, path, strip)
     if out is None:
-        print(draft(model, path), end="")
-        return 0
-    if out.exists():
-        return complain(f"{out} exists already")
-    check_out("out", out)
-    if path == Path(model):
-        model = os.path.relpath(path, out.parent)
-    write_atomically(out, draft(model, path))
-    print(f"{out}: see `mjx-balance robot check {out}`")
-    return 0
+        print(text, end="")
+    else:
+        write_atomically(out, text)
+        print(f"{out}: see `mjx-balance robot check {out}`")
+    for problem in problems:
+        complain(problem)
+    return FAILED if problems else 0

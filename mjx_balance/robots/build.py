@@ -5,134 +5,40 @@ position servos, an IMU and four foot spheres are added.
 """
 
 import functools
-import importlib.util
 import math
-from pathlib import Path
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from mjx_balance.errors import how_to_install
 from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.robots.measure import JOINT_ACTUATORS, check_joints, measure, pose
+from mjx_balance.robots.model import FRESH, Coupling, compile_model, model_path, read_model
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import Foot, LegFile, RobotError, RobotFile
 
-FRESH = mujoco.MjSpec()  #: MuJoCo's own defaults, for elements that we add to a maker's model
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
 BOARD_SIZE = "board_size"  #: name of the model's numeric element with `RobotFile.board_size`
-REMOVED = (
-    *("keys", "sensors", "excludes", "pairs", "equalities", "tuples", "numerics", "texts"),
-    *("tendons", "skins", "flexes", "lights", "cameras"),
-)
-"""Elements of the maker's model that are removed; what refers to others goes before those."""
 RADIUS_TOLERANCE = 1e-4  #: greatest difference between the radii of the feet, m
 
 
-def scene_dir() -> Path:
-    """Returns the folder of our MJCF files, in the package or, in a checkout, beside it."""
-    package = Path(__file__).resolve().parent.parent
-    installed = package / "scenes"
-    return installed if installed.is_dir() else package.parent / "scenes"
+class Build(NamedTuple):
+    """A robot's body and numbers."""
+
+    spec: mujoco.MjSpec  #: the body, its trunk's frame at the origin with x forward
+    robot: Robot
+    notes: list[str]
+    """What was mended, left out or is odd in its maker's model, one sentence each."""
 
 
-def model_path(model: str, folder: Path) -> Path:
-    """Finds a model file.
-
-    Args:
-      model: `RobotFile.model`.
-      folder: folder that a relative path starts from.
-
-    Raises:
-      RobotError: if there is none.
-    """
-    where, colon, inside = model.partition(":")
-    if not colon or len(where) == 1:  # no prefix, or the letter of a Windows drive
-        path = folder / model
-    elif where == "scenes":
-        path = scene_dir() / inside
-    elif where == "menagerie":
-        path = _menagerie(inside)
-    else:
-        path = _package(where, model) / inside
-    if "\0" in model or not path.is_file():
-        raise RobotError(f"model is {quote(model)}, but there is no file {path}")
-    return path
-
-
-def _package(name: str, model: str) -> Path:
-    """Folder of an installed Python package."""
-    try:
-        spec = importlib.util.find_spec(name)
-    except (ImportError, ValueError):  # its parent package is missing; it is no package name
-        spec = None
-    if spec is None or not spec.submodule_search_locations:
-        raise RobotError(
-            f"model is {quote(model)}, but the Python package {quote(name)} is not installed; "
-            "before a colon stands a package, and a file's path has none"
-        )
-    return Path(spec.submodule_search_locations[0])
-
-
-def _menagerie(name: str) -> Path:
-    try:
-        import mujoco_menagerie
-    except ImportError:
-        raise RobotError(
-            f"robot menagerie:{name} needs the package mujoco-menagerie; {how_to_install('robots')}"
-        ) from None
-    try:
-        robot = mujoco_menagerie.get(name)
-        return robot.xml(robot.default_model)
-    except (mujoco_menagerie.MenagerieError, OSError) as error:
-        raise RobotError(f"robot menagerie:{name} cannot be had: {error}") from error
-
-
-def read_model(path: Path) -> mujoco.MjSpec:
-    """Reads a model file; no visual geom is discarded and no static body is fused.
-
-    The root of a URDF gets a free joint if it has no joint.
-
-    Raises:
-      RobotError: with MuJoCo's message.
-    """
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise RobotError(f"{path} cannot be read: {_mujoco_message(error)}") from error
-    spec.compiler.discardvisual = spec.compiler.fusestatic = False  # True by default for URDF
-    if path.suffix.lower() == ".urdf":
-        for root in spec.worldbody.bodies:
-            if not root.joints:
-                root.add_freejoint()
-    return spec
-
-
-def compile_model(spec: mujoco.MjSpec, subject: str = "its model") -> mujoco.MjModel:
-    """Compiles a model; raises `RobotError` with MuJoCo's message about `subject`."""
-    try:
-        return spec.compile()
-    except ValueError as error:
-        raise RobotError(f"{subject} cannot be compiled: {_mujoco_message(error)}") from error
-
-
-def _mujoco_message(error: Exception) -> str:
-    """MuJoCo's error message in one line; its later lines name the element."""
-    lines = (line.strip() for line in str(error).splitlines())
-    return shorten("; ".join(line for line in lines if line), MESSAGE)
-
-
-def build(file: RobotFile, visual: bool = False) -> tuple[mujoco.MjSpec, Robot]:
+def build(file: RobotFile, visual: bool = False) -> Build:
     """Builds a robot.
 
     Args:
       file: the robot's file.
       visual: whether to keep the visual geoms.
-
-    Returns:
-      The body, its trunk's frame at the origin with x forward, and the robot's numbers.
 
     Raises:
       RobotError: if file and model do not match, or the model is no four-legged robot.
@@ -143,14 +49,17 @@ def build(file: RobotFile, visual: bool = False) -> tuple[mujoco.MjSpec, Robot]:
         raise RobotError(f"robot {file.name}: {error}") from error
 
 
-def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
-    spec = read_model(model_path(file.model, file.folder))
+def _build(file: RobotFile, visual: bool) -> Build:
+    spec, couplings, notes = read_model(model_path(file.model, file.folder), visual)
     trunk = _find(spec.bodies[1:], file.trunk, "trunk", "bodies")
     free = [j for j in trunk.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         raise RobotError(f"trunk {quote(file.trunk)} has no free joint; {_remedy(trunk)}")
-    _keep_inertia(spec, trunk)
+    notes += _keep_inertia(spec, trunk)
     _strip(spec, trunk, file)
+    notes += _left_out(spec, couplings, file)
+    if notes:
+        notes.append(_masses(compile_model(spec)))
     feet = {leg.name: _foot(spec, leg) for leg in file.legs}
     radius = _foot_radius(file, feet)
     spheres = _spheres(spec, feet, radius)
@@ -167,7 +76,7 @@ def _build(file: RobotFile, visual: bool) -> tuple[mujoco.MjSpec, Robot]:
     _equip(spec, robot, _imu(spec, trunk, bare, file))
     if file.board_size is not None:
         spec.add_numeric(name=BOARD_SIZE, data=[file.board_size])
-    return spec, robot
+    return Build(spec, robot, notes)
 
 
 def _remedy(trunk: mujoco.MjsBody) -> str:
@@ -190,10 +99,9 @@ def _find(elements: list, name: str, what: str, kind: str):
 
 def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
     """Removes what the file strips, and everything but the robot's bodies, joints and geoms."""
-    for kind in REMOVED:
-        for element in list(getattr(spec, kind)):
-            spec.delete(element)
-    _strip_elements(spec, trunk, file)
+    for key in list(spec.keys):
+        spec.delete(key)
+    _strip_file(spec, file)
     for actuator in list(spec.actuators):
         if actuator.trntype not in JOINT_ACTUATORS or spec.joint(actuator.target) is None:
             spec.delete(actuator)
@@ -201,33 +109,78 @@ def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
     around = [body for body in world.bodies if body.name != trunk.name]
     for element in (*around, *world.geoms, *world.sites):
         spec.delete(element)
-    for size in ("nkey", "nconmax", "njmax", "nuserdata", "memory"):
-        setattr(spec, size, getattr(FRESH, size))
 
 
-def _strip_elements(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
-    """Removes the bodies and joints that the file strips, with all that refers to them."""
-    joints = {joint.name for joint in spec.joints}
-    names = joints | {body.name for body in spec.bodies}
-    for name in file.strip:
-        if name not in names:
+def strip_elements(spec: mujoco.MjSpec, strip: Iterable[str], trunk: str = "") -> None:
+    """Removes bodies and joints with all that refers to them.
+
+    Args:
+      spec: the model.
+      strip: names of bodies and joints.
+      trunk: name of the body that must stay, and stay free; none: any that is free.
+
+    Raises:
+      RobotError: if a name is no body or joint, or takes the trunk or its freedom.
+    """
+
+    def free_joints() -> list[str]:
+        free = [x for x in spec.joints if x.type == mujoco.mjtJoint.mjJNT_FREE]
+        return [x.name for x in free if trunk in ("", x.parent.name)]
+
+    names = {element.name for element in (*spec.joints, *spec.bodies)}
+    fixed = not free_joints()
+    for name in strip:
+        if not name or name not in names:
             raise RobotError(
                 f"strip names {quote(name)}, which is no body and no joint of its model"
             )
-        if name in [joint.name for joint in trunk.joints]:
+        if name in free_joints():
             raise RobotError(f"strip names {quote(name)}, by which the trunk is free; it must be")
         for find in (spec.body, spec.joint):  # a body takes its joints along
             element = find(name)
             if element is not None and name != "world":
                 spec.delete(element)
-        if name == "world" or spec.body(file.trunk) is None:
+        if name == "world" or not (fixed or free_joints()):
             raise RobotError(f"strip names {quote(name)}, which is, or carries, the trunk")
+
+
+def _strip_file(spec: mujoco.MjSpec, file: RobotFile) -> None:
+    """Removes the bodies and joints that the file strips; checks that its legs are left."""
+    joints = {joint.name for joint in spec.joints}
+    strip_elements(spec, file.strip, file.trunk)
     gone = joints - {joint.name for joint in spec.joints}
     for leg in file.legs:
         for joint in [x for x in leg.joints if x in gone]:
             raise RobotError(
                 f"strip takes joint {quote(joint)} of leg {leg.name}, which the leg needs"
             )
+
+
+def _left_out(spec: mujoco.MjSpec, couplings: Iterable[Coupling], file: RobotFile) -> list[str]:
+    """Names the constraints that the robot goes without, and refuses those of its legs."""
+    roots = [spec.joint(leg.joints[0]) for leg in file.legs]
+    hips = [joint.parent for joint in roots if joint is not None]
+    legs = [x for hip in hips for x in (hip, *hip.find_all(mujoco.mjtObj.mjOBJ_BODY))]
+    notes = []
+    for coupling in couplings:
+        ends = [getattr(spec, kind)(name) for kind, name in coupling.ends]
+        if None in ends:  # stripped
+            continue
+        names = " and ".join(quote(name) for _, name in coupling.ends)
+        constraint = f"the {coupling.kind} constraint of {names}"
+        if any((x if isinstance(x, mujoco.MjsBody) else x.parent) in legs for x in ends):
+            raise RobotError(
+                f"{constraint} couples what a leg moves, and the joints of a leg must be free of "
+                "each other; strip the rods that it closes, or take it out of the model"
+            )
+        notes.append(f"{constraint} is left out")
+    return notes
+
+
+def _masses(model: mujoco.MjModel) -> str:
+    """The mass of every body, in one line."""
+    bodies = [model.body(k) for k in range(1, model.nbody)]
+    return f"masses in kg: {', '.join(f'{x.name} {x.mass[0]:.4g}' for x in bodies)}"
 
 
 class _FootPlace(NamedTuple):
@@ -273,22 +226,33 @@ def _foot_radius(file: RobotFile, feet: dict[str, _FootPlace]) -> float:
     return next(iter(sizes.values()))
 
 
-def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
-    """Makes explicit the inertia from geoms, which may be deleted later, and compiler options."""
+def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> list[str]:
+    """Makes explicit the inertia from geoms, which may be deleted later, and compiler options.
+
+    Returns:
+      A note of the bodies that are weighed by the volume of their geoms.
+    """
     bodies = [trunk, *trunk.find_all(mujoco.mjtObj.mjOBJ_BODY)]
     compiler = spec.compiler
     by_geoms = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     bounds = compiler.boundmass > 0 or compiler.boundinertia > 0
     changed = compiler.settotalmass > 0 or bounds or compiler.balanceinertia
     asked = [b for b in bodies if by_geoms or changed or not b.explicitinertial]
+    by_volume = ""
     if changed or any(geom.mass != 0 for body in asked for geom in body.geoms):
         model = compile_model(spec)
-        for body in asked:
-            if model.body_mass[body.id]:
-                _set_inertia(body, model)
+        weighed = [body for body in asked if model.body_mass[body.id]]
+        by_volume = ", ".join(
+            body.name
+            for body in weighed
+            if any(np.isnan(geom.mass) and geom.density > 0 for geom in body.geoms)
+        )
+        for body in weighed:
+            _set_inertia(body, model)
     compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     compiler.settotalmass, compiler.boundmass, compiler.boundinertia = -1, 0, 0
     compiler.balanceinertia = False
+    return [f"weighed by the volume of their geoms: {by_volume}"] if by_volume else []
 
 
 def _set_inertia(body: mujoco.MjsBody, model: mujoco.MjModel) -> None:
@@ -388,18 +352,18 @@ def _align(
 
 
 def _forward(file: RobotFile, data: mujoco.MjData) -> np.ndarray:
-    """Direction from hind to front hips, (2,); their longer side if the file names no ends."""
+    """Direction from hind to front hips, (2,); that of the abductions' axes without ends."""
     abductions = [data.joint(leg.joints[0]) for leg in file.legs]
     hips = np.asarray([joint.xanchor[:2] for joint in abductions])
     ends = [leg.end for leg in file.legs]
+    along = np.argmax(np.sum([np.abs(joint.xaxis[:2]) for joint in abductions], axis=0))
     if not any(ends):
-        return np.eye(2)[np.argmax(np.ptp(hips, axis=0))]
+        return np.eye(2)[along]
     if None in ends:
         raise RobotError("end is said of some legs only; say it of all, or of none")
     if ends.count("front") != 2:
         raise RobotError(f"{ends.count('front')} legs have end front; two must, and two hind")
     front = np.asarray(ends) == "front"
-    along = np.argmax(np.sum([np.abs(joint.xaxis[:2]) for joint in abductions], axis=0))
     ahead = hips[front, along] > hips[:, along].mean()
     if ahead[0] != ahead[1]:
         names = " and ".join(leg.name for leg in file.legs if leg.end == "front")

@@ -6,8 +6,9 @@ from pathlib import Path
 import mujoco
 
 from mjx_balance.files.text import quote
-from mjx_balance.robots.build import build, model_path
+from mjx_balance.robots.build import build
 from mjx_balance.robots.draft import draft
+from mjx_balance.robots.model import model_path
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import RobotError, RobotFile, parse_robot_file, read_robot_file
 
@@ -48,7 +49,7 @@ def _draft_file(model: str) -> RobotFile:
 
 def robot_spec(name: str, visual: bool = False) -> mujoco.MjSpec:
     """Returns a new robot body for a scene to attach; as `robot_file` and `build.build`."""
-    return build(robot_file(name), visual)[0]
+    return build(robot_file(name), visual).spec
 
 
 def robot_xml(name: str) -> str:
@@ -66,4 +67,9 @@ def find_robot(name: str) -> Robot:
 
 @functools.lru_cache(maxsize=64)
 def _build_robot(file: RobotFile, _: int) -> Robot:
-    return build(file)[1]
+    return build(file).robot
+
+
+def robot_notes(name: str) -> list[str]:
+    """Returns what was mended, left out or is odd in a robot's model; raises as `build.build`."""
+    return build(robot_file(name), visual=True).notes

@@ -2,16 +2,17 @@
 
 import itertools
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from mjx_balance.files.text import quote
-from mjx_balance.robots.build import RADIUS_TOLERANCE, compile_model, read_model
+from mjx_balance.files.text import quote, shorten
+from mjx_balance.robots.build import RADIUS_TOLERANCE, strip_elements
 from mjx_balance.robots.measure import ancestors
+from mjx_balance.robots.model import compile_model, read_model
 from mjx_balance.robots.schema import RobotError, parse_robot_file
 
 HEADER = """\
@@ -19,20 +20,29 @@ HEADER = """\
 # `mjx-balance robot check FILE` builds it, says what it found, and draws a picture.
 """
 USUAL_RADIUS = 0.02  #: radius of a foot that is no sphere, m
+CALF_RADII = 8  #: least length of a calf, in radii of its foot
 MIN_REACH = 0.85
 """Least distance of a foot from the knee, as a share of the calf's length; a sphere or site that
 is nearer is no foot."""
+NAMELESS, MISSING = "?", ('["ABDUCTION", "HIP", "KNEE"]', '"FOOT"')
+GIVE = "give it one in its model, for the file to use"
 CORNERS = {"FL": "front left", "FR": "front right", "RL": "rear left", "RR": "rear right"}
+
+
+class _Foot(NamedTuple):
+    text: str  #: value of `foot` in the file, TOML
+    place: np.ndarray  #: in the world, (3,) m
+    radius: float  #: m
+    sphere: bool = False  #: whether `text` names a sphere geom, which gives the radius
 
 
 class _Leg(NamedTuple):
     """Three hinges on three nested bodies, with no other joint on them, and a foot."""
 
     joints: list[int]
-    foot: str  #: value of `foot` in the file, TOML
-    place: np.ndarray  #: of the foot in the world, (3,) m
-    radius: float  #: of the foot, m
-    sphere: bool = False  #: whether `foot` names a sphere geom, which gives the radius
+    foot: _Foot
+    length: float  #: of thigh and calf, m
+    like_a_leg: bool  #: whether the axes of hip and knee are parallel, and across the first
 
 
 def draft(model: str, path: Path) -> str:
@@ -46,33 +56,109 @@ def draft(model: str, path: Path) -> str:
       RobotError: if the model cannot be read, its trunk is not free, a corner has no leg or two,
         or a joint has no name.
     """
-    compiled = compile_model(read_model(path), str(path))
-    data = mujoco.MjData(compiled)
-    mujoco.mj_kinematics(compiled, data)
-    trunk = _trunk(compiled, path)
-    legs = [_leg(compiled, data, *chain) for chain in _chains(compiled, trunk)]
-    legs = sorted(legs, key=lambda leg: leg.place[2])[:4]
-    if len(legs) < 4:
-        names = ", ".join(compiled.joint(leg.joints[0]).name for leg in legs) or "none"
-        raise RobotError(
-            f"{path} has {len(legs)} chains of three hinges below its trunk ({names}); a robot of "
-            "this kind has four legs"
-        )
-    text = _render(compiled, data, model, trunk, legs)
+    text, problems = sketch(model, path)
+    if problems:
+        raise RobotError(problems[0])
     parse_robot_file(text, path)
     return text
 
 
-def _trunk(model: mujoco.MjModel, path: Path) -> int:
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    if not len(free):
-        raise RobotError(f"{path} has no free joint; its trunk must be free to move")
-    bodies = model.jnt_bodyid[free]
-    return int(bodies[np.argmax(model.body_subtreemass[bodies])])
+def sketch(model: str, path: Path, strip: Sequence[str] = ()) -> tuple[str, list[str]]:
+    """Drafts a robot file, as far as the model allows.
+
+    Args:
+      model: value of `model` in the file.
+      path: path of the model.
+      strip: bodies to leave out, and joints to fix.
+
+    Returns:
+      The text, and what has to be mended, one sentence each. Then the text says so too, and lines
+      that are not complete are comments.
+
+    Raises:
+      RobotError: if the model cannot be read, or has nothing that could be a leg.
+    """
+    spec = read_model(path).spec
+    strip_elements(spec, strip)
+    problems = []
+    if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints):
+        root = max(spec.worldbody.bodies, key=_size, default=None)
+        if root is None:
+            raise RobotError(f"{path.name} has no body")
+        problems.append(
+            f"{path.name} has no free joint; its trunk must be free to move: write <freejoint/> "
+            f"into its body {quote(root.name)}, in place of joints that it has"
+        )
+        for joint in root.joints:
+            spec.delete(joint)
+        root.add_freejoint()
+    compiled = compile_model(spec, path.name)
+    data = mujoco.MjData(compiled)
+    mujoco.mj_kinematics(compiled, data)
+    free = compiled.jnt_bodyid[compiled.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    trunk = int(free[np.argmax(compiled.body_subtreemass[free])])
+    legs = _legs(compiled, data, trunk, path, problems)
+    text = _render(compiled, data, model, trunk, legs, strip, problems)
+    mend = "".join(f"# To mend: {problem}.\n" for problem in problems)
+    return HEADER + mend + text, problems
 
 
-def _chains(model: mujoco.MjModel, trunk: int) -> Iterator[tuple[list[int], list[int]]]:
-    """The joints of every leg, and the last one's body with the bodies fixed to it."""
+def _size(body: mujoco.MjsBody) -> int:
+    return len(body.find_all(mujoco.mjtObj.mjOBJ_BODY))
+
+
+def _legs(
+    model: mujoco.MjModel, data: mujoco.MjData, trunk: int, path: Path, problems: list[str]
+) -> list[_Leg]:
+    """The four lowest chains of three hinges; says where others could be legs as well."""
+    limbs = list(_limbs(model, trunk))
+    chains = [limb for limb in limbs if limb.chain]
+    legs = [_leg(model, data, limb.joints, limb.calf) for limb in chains]
+    legs = sorted(legs, key=lambda leg: leg.foot.place[2])
+    first = legs[:4]
+    if len(first) < 4:
+        names = _names(model, [leg.joints[0] for leg in legs]) or "none"
+        problem = f"{path.name} has {len(legs)} chains of three hinges below its trunk ({names})"
+        if not limbs:
+            raise RobotError(f"{problem}, and no other joint; it is no legged robot")
+        other = max((x.joints for x in limbs if not x.chain), key=len, default=[])
+        remedy = "a robot of this kind has four legs of three: abduction, hip, knee"
+        if len(other) > 3:
+            remedy = "fix joints, or leave bodies out, by `robot new --strip NAME`"
+        limb = f", and a limb of {_names(model, other)}" if other else ""
+        problems.append(f"{problem}{limb}; {remedy}")
+        return first
+    hips = [data.xanchor[leg.joints[0], 2] for leg in first]
+    length = max(leg.length for leg in first)
+    if np.ptp(hips) > length / 2:
+        problems.append(
+            f"{path.name} has chains of three hinges that begin {np.ptp(hips):.2f} m above others; "
+            "they are arms, and a robot of this kind has four legs"
+        )
+    lowest = max(leg.foot.place[2] for leg in first)
+    low = [x for x in legs if x.like_a_leg and x.foot.place[2] < lowest + length / 2]
+    if len(low) > 4:
+        names = _names(model, [leg.joints[0] for leg in low])
+        problems.append(
+            f"{path.name} has {len(low)} chains that could be legs ({names}); a robot of this kind "
+            "has four: leave the bodies of others out by `robot new --strip NAME`"
+        )
+    return first
+
+
+class _Limb(NamedTuple):
+    """The joints below a body on which none above moves but the trunk's."""
+
+    joints: list[int]
+    calf: list[int]  #: the last joint's body, with the bodies fixed to it
+    chain: bool  #: whether these are three hinges on three nested bodies, with no other joint
+
+
+def _names(model: mujoco.MjModel, joints: list[int]) -> str:
+    return shorten(", ".join(model.joint(k).name or "(no name)" for k in joints), 120)
+
+
+def _limbs(model: mujoco.MjModel, trunk: int) -> Iterator[_Limb]:
     above = [ancestors(model, body) for body in range(model.nbody)]
     moving = [b for b in range(model.nbody) if model.body_jntnum[b] and trunk in above[b]]
     for start in moving:
@@ -82,14 +168,24 @@ def _chains(model: mujoco.MjModel, trunk: int) -> Iterator[tuple[list[int], list
         joints = [k for k in range(model.njnt) if model.jnt_bodyid[k] in links]
         hinges = all(model.jnt_type[k] == mujoco.mjtJoint.mjJNT_HINGE for k in joints)
         nested = all(a in above[b] for a, b in itertools.pairwise(links))
-        if len(joints) == len(links) == 3 and hinges and nested:
-            calf = [b for b in range(model.nbody) if links[-1] in (b, *above[b])]
-            yield joints, calf
+        calf = [b for b in range(model.nbody) if links[-1] in (b, *above[b])]
+        yield _Limb(joints, calf, len(joints) == len(links) == 3 and hinges and nested)
 
 
 def _leg(model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], calf: list[int]) -> _Leg:
-    """Its foot is the sphere furthest from the knee, else the furthest site or geom point."""
-    knee = data.xanchor[joints[2]]
+    foot = _foot(model, data, data.xanchor[joints[2]], calf)
+    points = [*data.xanchor[joints[1:]], foot.place]
+    abduction, hip, knee = data.xaxis[joints]
+    return _Leg(
+        joints,
+        foot,
+        length=sum(float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(points)),
+        like_a_leg=bool(abs(hip @ knee) > 0.9 and abs(abduction @ hip) < 0.5),
+    )
+
+
+def _foot(model: mujoco.MjModel, data: mujoco.MjData, knee: np.ndarray, calf: list[int]) -> _Foot:
+    """The sphere furthest from the knee, else the furthest site or geom point."""
 
     def distance(place: np.ndarray) -> float:
         return float(np.linalg.norm(place - knee))
@@ -108,14 +204,15 @@ def _leg(model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], calf: li
     if sphere is not None:
         geom, place, radius = model.geom(sphere), data.geom_xpos[sphere], model.geom_size[sphere, 0]
         if geom.name:
-            return _Leg(joints, _toml(geom.name), place, radius, True)
-        return _Leg(joints, _offset(model, data, int(geom.bodyid[0]), place), place, radius)
+            return _Foot(_toml(geom.name), place, radius, True)
+        return _Foot(_offset(model, data, int(geom.bodyid[0]), place), place, radius)
     sites = [s for s in range(model.nsite) if model.site_bodyid[s] in calf]
     site = select([s for s in sites if model.site(s).name], data.site_xpos)
+    radius = min(USUAL_RADIUS, distance(furthest) / CALF_RADII)
     if site is not None:
-        return _Leg(joints, _toml(model.site(site).name), data.site_xpos[site], USUAL_RADIUS)
-    place = furthest - USUAL_RADIUS * (furthest - knee) / max(distance(furthest), USUAL_RADIUS)
-    return _Leg(joints, _offset(model, data, calf[0], place), place, USUAL_RADIUS)
+        return _Foot(_toml(model.site(site).name), data.site_xpos[site], radius)
+    place = furthest - radius * (furthest - knee) / max(distance(furthest), radius, 1e-9)
+    return _Foot(_offset(model, data, calf[0], place), place, radius)
 
 
 def _points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> list[np.ndarray]:
@@ -134,30 +231,28 @@ def _points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> list[np.nd
 def _offset(model: mujoco.MjModel, data: mujoco.MjData, body: int, place: np.ndarray) -> str:
     at = data.xmat[body].reshape(3, 3).T @ (place - data.xpos[body])
     numbers = ", ".join(f"{x + 0.0:.4g}" for x in at)
-    name = _toml(model.body(body).name, f"body {body}, which holds a foot,")
-    return f"{{ body = {name}, offset = [{numbers}] }}"
+    return f"{{ body = {_toml(model.body(body).name)}, offset = [{numbers}] }}"
 
 
-def _toml(name: str, what: str = "") -> str:
-    """The name of `what` as a TOML string."""
-    if not name:
-        raise RobotError(f"{what} has no name; give it one in its model, for the file to use")
-    return json.dumps(name, ensure_ascii=False)
+def _toml(name: str) -> str:
+    return json.dumps(name or NAMELESS, ensure_ascii=False)
 
 
 def _joints(model: mujoco.MjModel, joints: Iterable[int]) -> str:
     """Names of joints as a TOML array."""
-    holders = {k: model.body(int(model.jnt_bodyid[k])).name for k in joints}
-    names = [_toml(model.joint(k).name, f"a joint of body {quote(holders[k])}") for k in holders]
-    return f"[{', '.join(names)}]"
+    return f"[{', '.join(_toml(model.joint(k).name) for k in joints)}]"
 
 
-def _render(
-    model: mujoco.MjModel, data: mujoco.MjData, name: str, trunk: int, legs: list[_Leg]
-) -> str:
+def _corners(
+    model: mujoco.MjModel, data: mujoco.MjData, trunk: int, legs: list[_Leg], problems: list[str]
+) -> tuple[dict[str, _Leg], bool]:
+    """The leg of each corner, and whether the model looks along its y, as its abductions turn."""
+    if not legs:
+        return {}, False
     turn = data.xmat[trunk].reshape(3, 3).T
     hips = [turn @ (data.xanchor[leg.joints[0]] - data.xpos[trunk]) for leg in legs]
-    forward = int(np.argmax(np.ptp(hips, axis=0)[:2]))
+    axes = [turn @ data.xaxis[leg.joints[0]] for leg in legs]
+    forward = int(np.argmax(np.abs(axes).sum(axis=0)[:2]))
     corners: dict[str, _Leg] = {}
     for hip, leg in zip(hips - np.mean(hips, axis=0), legs, strict=True):
         ahead, left = hip[forward], hip[1] if forward == 0 else -hip[0]
@@ -165,12 +260,26 @@ def _render(
         other = corners.setdefault(corner, leg)
         if other is not leg:
             both = _joints(model, (other.joints[0], leg.joints[0]))
-            raise RobotError(
+            problems.append(
                 f"the legs of joints {both} both stand {CORNERS[corner]}; each corner has one"
             )
-    trunks = _toml(model.body(trunk).name, "the body of the free joint, the trunk,")
-    lines = [f"{HEADER}model = {_toml(name, 'the model')}", f"trunk = {trunks}"]
-    if forward == 1:
+    return corners, forward == 1
+
+
+def _render(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    name: str,
+    trunk: int,
+    legs: list[_Leg],
+    strip: Sequence[str],
+    problems: list[str],
+) -> str:
+    corners, turned = _corners(model, data, trunk, legs, problems)
+    if not model.body(trunk).name:
+        problems.append(f"the body of the free joint, the trunk, has no name; {GIVE}")
+    lines = [f"model = {_toml(name)}", f"trunk = {_toml(model.body(trunk).name)}"]
+    if turned:
         lines.append(
             '# Looks along its y, it seems; if not, say end = "front" or "hind" of all legs.'
         )
@@ -178,16 +287,25 @@ def _render(
     lines += [f"imu = {_toml(imu)}" for imu in imus if "imu" in imu.lower()][:1]
     used = {joint for leg in legs for joint in leg.joints}
     hinges = np.flatnonzero(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
-    fixed = [int(k) for k in hinges if k not in used]
-    if fixed:
-        lines.append(
-            f"strip = {_joints(model, fixed)}  # fixed; a body's name instead leaves it out"
-        )
-    radii = [leg.radius for leg in legs]
-    if np.ptp(radii) > RADIUS_TOLERANCE or not all(leg.sphere for leg in legs):
+    fixed = [model.joint(int(k)).name for k in hinges if k not in used]
+    if fixed or strip:
+        names = ", ".join(map(_toml, (*strip, *fixed)))
+        line = f"strip = [{names}]  # fixed; a body's name instead leaves it out"
+        lines.append(line if len(corners) == 4 else f"# {line}")
+    feet = [leg.foot for leg in legs]
+    radii = [foot.radius for foot in feet]
+    if feet and (np.ptp(radii) > RADIUS_TOLERANCE or not all(foot.sphere for foot in feet)):
         lines.append(f"foot_radius = {max(radii):.4g}")
     for corner in CORNERS:
-        leg = corners[corner]
-        joints = _joints(model, leg.joints)
-        lines += ["", f"[legs.{corner}]", f"joints = {joints}", f"foot = {leg.foot}"]
+        leg = corners.get(corner)
+        joints, foot = MISSING if leg is None else (_joints(model, leg.joints), leg.foot.text)
+        lines += ["", f"[legs.{corner}]", f"joints = {joints}", f"foot = {foot}"]
+        for k in leg.joints if leg else ():
+            if not model.joint(k).name:
+                holder = quote(model.body(int(model.jnt_bodyid[k])).name)
+                problems.append(f"a joint of body {holder} has no name; {GIVE}")
+        if leg and NAMELESS in leg.foot.text:
+            problems.append(f"the body that holds the foot of leg {corner} has no name; {GIVE}")
+    mend = (MISSING[0], MISSING[1], _toml(NAMELESS))
+    lines = [f"# {line}" if any(x in line for x in mend) else line for line in lines]
     return "\n".join(lines) + "\n"

@@ -12,13 +12,17 @@ from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.files.validation import STRICT, parse
 from mjx_balance.robots.robot import MOST, Number
 
+MAX_FILE = 2**20  #: greatest size of a robot file, bytes
 Name = Annotated[str, MinLen(1)]
 Positive = Annotated[float, Gt(0), Le(MOST)]
 Place = tuple[Number, Number, Number]  #: x, y and z, m
 
 
 class RobotError(ConfigError):
-    """A robot that cannot be found, read or built; the message says why."""
+    """A robot that cannot be found, read or built; the message says why, in one short line."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(shorten(message, MESSAGE))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +101,12 @@ def read_robot_file(path: Path) -> RobotFile:
       RobotError: if it is missing, unreadable or invalid.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        if path.exists() and not path.is_file():
+            raise RobotError(f"{path} is no regular file")
+        with path.open("rb") as file:
+            text = file.read(MAX_FILE + 1).decode("utf-8-sig")
+        if len(text) > MAX_FILE:
+            raise RobotError(f"{path} is larger than {MAX_FILE} bytes, the most")
     except FileNotFoundError:
         raise RobotError(
             f"no robot file at {path}; `mjx-balance robot new MODEL.xml` drafts one"

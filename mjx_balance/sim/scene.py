@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mjx_balance.config import Config, ConfigError, TaskConfig
-from mjx_balance.robots.build import ACCELEROMETER, BOARD_SIZE, GYRO, VISUAL_GROUP, scene_dir
+from mjx_balance.robots.build import ACCELEROMETER, BOARD_SIZE, GYRO, VISUAL_GROUP
 from mjx_balance.robots.catalogue import Robot, find_robot, robot_file, robot_spec
 from mjx_balance.robots.limits import check_robot
+from mjx_balance.robots.model import scene_dir
 from mjx_balance.task import Array
 from mjx_balance.task.kinematics import joint_angles
 from mjx_balance.task.step import Targets

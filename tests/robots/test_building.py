@@ -683,7 +683,7 @@ def test_what_does_not_fit_is_named(
     ("old", "new", "message"),
     [
         ('name="LF_knee" class="knee"/>', 'nom="LF_knee"/>', "'nom'; Element 'joint', line "),
-        ("0.0012 0.0012", "1 0.0012", "be compiled: .*inertia .*; Element name 'LF_calf'"),
+        ("0.0012 0.0012", "1 0.0012", "body 'LF_calf' of 0.24 kg .* inertia 5e-05, 0.0012, 1 kg"),
     ],
 )
 def test_mujocos_words_name_the_element(tmp_path: Path, old: str, new: str, message: str) -> None:

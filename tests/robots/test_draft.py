@@ -12,10 +12,11 @@ import pytest
 from fixtures import bodies
 
 from mjx_balance.config import check, preset
-from mjx_balance.robots.build import build, model_path
+from mjx_balance.robots.build import build
 from mjx_balance.robots.catalogue import Robot, RobotError, find_robot
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.limits import for_robot
+from mjx_balance.robots.model import model_path
 from mjx_balance.robots.schema import Foot, parse_robot_file
 from mjx_balance.sim.scene import load_scene
 

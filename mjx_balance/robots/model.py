@@ -1,0 +1,425 @@
+"""Finds, bounds, reads and mends a maker's model; nothing of it is run, and nothing imported."""
+
+import html
+import importlib.util
+import math
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from mjx_balance.errors import how_to_install
+from mjx_balance.files.text import MESSAGE, quote, shorten
+from mjx_balance.robots import urdf
+from mjx_balance.robots.schema import RobotError
+
+FRESH = mujoco.MjSpec()  #: MuJoCo's own defaults, for elements that we add to a maker's model
+REMOVED = (
+    *("sensors", "excludes", "pairs", "equalities", "tuples", "numerics", "texts", "tendons"),
+    *("skins", "flexes", "lights", "cameras", "hfields"),
+)
+"""Elements of the maker's model that are removed; what refers to others goes before those."""
+SIZES = ("nkey", "nconmax", "njmax", "nuserdata", "memory")
+SIZES += tuple(name for name in dir(FRESH) if name.startswith("nuser_"))
+
+MAX_TEXT = 2**24  #: greatest size of a model's XML, with all that it includes, bytes
+MAX_COPIES = 10_000  #: greatest product of the counts that an XML asks to repeat elements by
+MAX_PARAMETER = 200  #: greatest parameter of a mesh that MuJoCo makes, such as its resolution
+MAX_ELEMENTS = 10_000  #: greatest number of bodies, of geoms and so on
+MAX_MESH = 2**28  #: greatest size of a mesh file, bytes
+MAX_FACES = 200_000  #: of an STL file; MuJoCo reads no more
+MAX_PIXELS = 2**24  #: of a texture or height field
+SLIGHT = 0.05
+"""Greatest share of a moment of inertia by which it may exceed the sum of the other two, and be
+mended; CAD programs round, and drop parts, by as much."""
+
+
+class Coupling(NamedTuple):
+    """An equality constraint of the maker's model, which ours has not."""
+
+    kind: str
+    ends: tuple[tuple[str, str], ...]  #: kind and name of the elements that it couples
+
+
+class Model(NamedTuple):
+    """A maker's model, with everything removed that is neither robot nor shown."""
+
+    spec: mujoco.MjSpec
+    couplings: tuple[Coupling, ...]
+    notes: list[str]  #: what was mended or left out, one sentence each
+
+
+def scene_dir() -> Path:
+    """Returns the folder of our MJCF files, in the package or, in a checkout, beside it."""
+    package = Path(__file__).resolve().parent.parent
+    installed = package / "scenes"
+    return installed if installed.is_dir() else package.parent / "scenes"
+
+
+def model_path(model: str, folder: Path) -> Path:
+    """Finds a model file.
+
+    Args:
+      model: `RobotFile.model`.
+      folder: folder that a relative path starts from.
+
+    Raises:
+      RobotError: if there is none.
+    """
+    where, colon, inside = model.partition(":")
+    if not colon or len(where) == 1:  # no prefix, or the letter of a Windows drive
+        path = folder / model
+    elif where == "scenes":
+        path = scene_dir() / inside
+    elif where == "menagerie":
+        path = _menagerie(inside)
+    else:
+        path = _package(where, model) / inside
+    if "\0" in model or not path.is_file():
+        raise RobotError(f"model is {quote(model)}, but there is no file {shorten(path, MESSAGE)}")
+    return path
+
+
+def _package(name: str, model: str) -> Path:
+    """Folder of an installed Python package, which is not imported, and neither are its parents."""
+    first, *inner = name.split(".")
+    try:
+        spec = importlib.util.find_spec(first) if first.isidentifier() else None
+    except ValueError:  # a module without a spec, such as __main__
+        spec = None
+    folders = (spec.submodule_search_locations if spec else None) or []
+    for folder in folders:
+        if all(map(str.isidentifier, inner)) and Path(folder, *inner).is_dir():
+            return Path(folder, *inner)
+    raise RobotError(
+        f"model is {quote(model)}, but the Python package {quote(name)} is not installed; "
+        "before a colon stands a package, and a file's path has none"
+    )
+
+
+def _menagerie(name: str) -> Path:
+    try:
+        import mujoco_menagerie
+    except ImportError:
+        raise RobotError(
+            f"robot menagerie:{name} needs the package mujoco-menagerie; {how_to_install('robots')}"
+        ) from None
+    try:
+        robot = mujoco_menagerie.get(name)
+        return robot.xml(robot.default_model)
+    except (mujoco_menagerie.MenagerieError, OSError) as error:
+        raise RobotError(f"robot menagerie:{name} cannot be had: {error}") from error
+
+
+def read_model(path: Path, visual: bool = False) -> Model:
+    """Reads a model file; no static body is fused.
+
+    The root of a URDF gets a free joint if it has no joint. Links without `<inertial>` weigh
+    nothing there, as a URDF has it.
+
+    Args:
+      path: MJCF or URDF.
+      visual: whether a URDF's visual shapes are read.
+
+    Raises:
+      RobotError: if it is too large, unreadable, or a link cannot have the inertia that it has.
+    """
+    _check_text(path)
+    is_urdf = path.suffix.lower() in (".urdf", ".xacro")
+    if is_urdf:
+        text = urdf.read(path, visual)
+        spec = _parse(lambda: mujoco.MjSpec.from_string(text), path)
+        spec.modelfiledir = f"{path.parent}/"
+    else:
+        spec = _parse(lambda: mujoco.MjSpec.from_file(str(path)), path)
+    spec.compiler.discardvisual = spec.compiler.fusestatic = False  # True by default for URDF
+    _check_elements(spec, path)
+    couplings = tuple(_couplings(spec))
+    _clean(spec)
+    notes: list[str] = []
+    if is_urdf:
+        for root in spec.worldbody.bodies:
+            if not root.joints:
+                root.add_freejoint()
+        notes += _weigh_links(spec)
+    return Model(spec, couplings, [*notes, *_mend_inertias(spec), *_drop_unreadable(spec)])
+
+
+def _parse(read: Callable[[], mujoco.MjSpec], path: Path) -> mujoco.MjSpec:
+    try:
+        return read()
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        raise RobotError(f"{path.name} cannot be read: {_mujoco_message(error)}") from error
+
+
+def compile_model(spec: mujoco.MjSpec, subject: str = "its model") -> mujoco.MjModel:
+    """Compiles a model; raises `RobotError` with MuJoCo's message about `subject`."""
+    try:
+        return spec.compile()
+    except (ValueError, RuntimeError, mujoco.FatalError, MemoryError) as error:
+        message = _mujoco_message(error)
+        remedy = next((words for part, words in REMEDIES.items() if part in message), "")
+        raise RobotError(f"{subject} cannot be compiled: {message}{remedy}") from error
+
+
+REMEDIES = {
+    "mass and inertia of moving bodies": (
+        "; write its mass and moments of inertia, or fix its joint by strip"
+    ),
+}
+"""Remedies of errors, by a part of MuJoCo's message."""
+
+
+def _mujoco_message(error: Exception) -> str:
+    """MuJoCo's error message in one line; its later lines name the element."""
+    lines = (line.strip() for line in str(error).splitlines())
+    return shorten("; ".join(line for line in lines if line), MESSAGE)
+
+
+_TAG = re.compile(
+    rb"<\s*(replicate|composite|flexcomp|mesh|hfield|include|model)\b((?:[^\"'>]|\"[^\"]*\"|'[^']*')*+)"
+)
+_ATTRIBUTE = re.compile(r"([\w:]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
+
+
+def _check_text(path: Path) -> None:
+    """Bounds what reading a file can take: its size, its files' sizes, and copies of elements."""
+    files, size, copies = [path], 0, 1
+    for file in files:  # grows by what is included
+        if not file.is_file():
+            raise RobotError(f"{path.name} includes {quote(str(file))}, which is no regular file")
+        size += file.stat().st_size
+        if size > MAX_TEXT:
+            raise RobotError(f"{path.name} has more than {MAX_TEXT >> 20} MiB of XML, the most")
+        for tag, attributes in _TAG.findall(file.read_bytes()):
+            pairs = _ATTRIBUTE.findall(html.unescape(attributes.decode(errors="replace")))
+            values = {name: first or second for name, first, second in pairs}
+            if tag in (b"include", b"model"):
+                places = {folder / values.get("file", "") for folder in (path.parent, file.parent)}
+                files += [x for x in places if x.exists() and x not in files and not x.is_dir()]
+            elif tag == b"hfield":
+                points = math.prod(_integers(f"{values.get('nrow', 0)} {values.get('ncol', 0)}"))
+                if points > MAX_PIXELS:
+                    raise RobotError(
+                        f"{path.name} has a height field of {points:.3g} points; it must have at "
+                        f"most {MAX_PIXELS}"
+                    )
+            elif tag == b"mesh":
+                made = [x for x in _integers(values.get("params", "")) if x > MAX_PARAMETER]
+                if "builtin" in values and made:
+                    raise RobotError(
+                        f"{path.name} has a mesh with parameter {made[0]:g}; it must be at most "
+                        f"{MAX_PARAMETER}"
+                    )
+            else:
+                for count in _integers(values.get("count", "")):
+                    copies *= max(1, count)
+    if copies > MAX_COPIES:
+        raise RobotError(
+            f"{path.name} repeats elements up to {copies:.3g} times by replicate, composite or "
+            f"flexcomp; at most {MAX_COPIES} times"
+        )
+
+
+def _integers(text: str) -> list[int]:
+    """The numbers of an attribute, rounded down; one that is none is as large as can be."""
+    words = text.split()
+    return [int(float(x)) if re.fullmatch(r"[-+]?[\d.]{1,9}", x) else 10**9 for x in words]
+
+
+def _check_elements(spec: mujoco.MjSpec, path: Path) -> None:
+    """Bounds the numbers of elements, and checks that their names are text."""
+    kinds = ("bodies", "geoms", "joints", "sites", "meshes", "materials", "textures", "actuators")
+    for kind in (*kinds, "keys", "plugins", *REMOVED):
+        elements = list(getattr(spec, kind))
+        if len(elements) > MAX_ELEMENTS:
+            raise RobotError(
+                f"{path.name} has {len(elements)} {kind}; it must have at most {MAX_ELEMENTS}"
+            )
+        try:
+            [element.name for element in elements if hasattr(element, "name")]
+        except UnicodeDecodeError:
+            raise RobotError(f"{path.name} has a name among its {kind} that is not UTF-8") from None
+    if any(x.plugin.active for x in (*spec.bodies, *spec.geoms, *spec.meshes)):
+        raise RobotError(
+            f"{path.name} needs a plugin of MuJoCo, which are not loaded; leave it out"
+        )
+
+
+def _couplings(spec: mujoco.MjSpec) -> list[Coupling]:
+    """The active equality constraints between bodies, sites and joints."""
+    couplings = []
+    tendons = {x.name: x for x in spec.tendons}
+    for one in spec.equalities:
+        names = [name for name in (one.name1, one.name2) if name]
+        if one.type == mujoco.mjtEq.mjEQ_TENDON:
+            wraps = [x.target for name in names if name in tendons for x in tendons[name].path]
+            ends = [("joint", x.name) for x in wraps if isinstance(x, mujoco.MjsJoint)]
+        elif one.type == mujoco.mjtEq.mjEQ_JOINT:
+            ends = [("joint", name) for name in names]
+        else:
+            kind = "site" if one.objtype == mujoco.mjtObj.mjOBJ_SITE else "body"
+            ends = [(kind, name) for name in names]
+        if one.active:
+            couplings.append(Coupling(one.type.name.removeprefix("mjEQ_").lower(), tuple(ends)))
+    return couplings
+
+
+def _clean(spec: mujoco.MjSpec) -> None:
+    """Removes what the robot is not made of, before it costs memory or stops a compilation."""
+    for geom in [x for x in spec.geoms if x.type == mujoco.mjtGeom.mjGEOM_HFIELD]:
+        spec.delete(geom)
+    for kind in REMOVED:
+        for element in list(getattr(spec, kind)):
+            spec.delete(element)
+    for size in SIZES:
+        setattr(spec, size, getattr(FRESH, size))
+    for element in (*spec.bodies, *spec.joints, *spec.geoms, *spec.sites, *spec.actuators):
+        element.userdata = []
+
+
+def _drop_unreadable(spec: mujoco.MjSpec) -> list[str]:
+    """Removes meshes and textures that cannot be read, with the geoms made of them."""
+    gone = {x.name: x for x in spec.meshes if not _readable(spec, x)}
+    for geom in [x for x in spec.geoms if x.meshname in gone]:
+        weighs = not (geom.mass == 0 or geom.density == 0 or geom.parent.explicitinertial)
+        if weighs and geom.parent.name != "world":
+            raise RobotError(
+                f"mesh {quote(gone[geom.meshname].file)}, by which body "
+                f"{quote(geom.parent.name)} is weighed, cannot be read; supply it, or write the "
+                "body's <inertial>"
+            )
+        spec.delete(geom)
+    for mesh in gone.values():
+        spec.delete(mesh)
+    for texture in [x for x in spec.textures if not _drawable(spec, x)]:
+        for material in spec.materials:
+            material.textures = ["" if x == texture.name else x for x in material.textures]
+        spec.delete(texture)
+    files = ", ".join(sorted({Path(x.file).name for x in gone.values()}))
+    return [f"not shown, for they are no readable STL, OBJ or MSH files: {files}"] if gone else []
+
+
+def _file(spec: mujoco.MjSpec, element: mujoco.MjsMesh | mujoco.MjsTexture) -> Path:
+    mesh = isinstance(element, mujoco.MjsMesh)
+    folder = element.compiler.meshdir if mesh else element.compiler.texturedir
+    return Path(spec.modelfiledir, folder, element.file)
+
+
+def _readable(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
+    """Whether MuJoCo can read a mesh's file, by its size, suffix and head."""
+    if not mesh.file:
+        return True
+    path = _file(spec, mesh)
+    if not path.is_file() or path.stat().st_size > MAX_MESH:
+        return False
+    if path.suffix.lower() != ".stl":
+        return bool(mesh.content_type) or path.suffix.lower() in (".obj", ".msh")
+    with path.open("rb") as file:  # binary: a head of 80 bytes, the number of faces, 50 bytes each
+        faces = int.from_bytes(file.read(84)[80:], "little")
+    return 0 < faces <= MAX_FACES and path.stat().st_size == 84 + 50 * faces
+
+
+def _drawable(spec: mujoco.MjSpec, texture: mujoco.MjsTexture) -> bool:
+    """Whether a texture's files exist, and it is small enough."""
+    pixels = texture.width * texture.height
+    for name in filter(None, (texture.file, *texture.cubefiles)):
+        path = _file(spec, texture).parent / Path(name).name
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            head = file.read(24)
+        if head.startswith(b"\x89PNG"):
+            pixels = int.from_bytes(head[16:20]) * int.from_bytes(head[20:24])
+    return pixels <= MAX_PIXELS
+
+
+def _weigh_links(spec: mujoco.MjSpec) -> list[str]:
+    """Takes the weight of links without `<inertial>`; MuJoCo weighs their shapes as water."""
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        return []
+    light = [x for x in spec.bodies[1:] if not x.explicitinertial]
+    for body in light:
+        for geom in body.geoms:
+            geom.mass = 0
+    for body in light:
+        if body.joints and body.parent.name != "world" and _mass(_rigid(body)) == 0:
+            raise RobotError(
+                f"link {quote(body.name)} moves, but neither it nor what is fixed to it has an "
+                "<inertial>; write its mass and moments of inertia"
+            )
+    shaped = ", ".join(x.name for x in light if x.geoms)
+    return [f"links without <inertial> weigh nothing: {shaped}"] if shaped else []
+
+
+def _rigid(body: mujoco.MjsBody) -> list[mujoco.MjsBody]:
+    """The bodies that move as one with a body, itself included."""
+    while not body.joints and body.parent.name != "world":
+        body = body.parent
+    fixed = [body]
+    for one in fixed:  # grows
+        fixed += [child for child in one.bodies if not child.joints]
+    return fixed
+
+
+def _mass(bodies: Iterable[mujoco.MjsBody]) -> float:
+    return sum(body.mass for body in bodies if body.explicitinertial)
+
+
+def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
+    """Mends moments of inertia that no body can have where that changes next to nothing.
+
+    That is on bodies fixed to a heavier one, and where the sum of two moments misses the third by
+    less than `SLIGHT`. A body's second moments of mass, half the trace less a principal moment,
+    cannot be negative; the nearest inertia has 0 instead.
+    """
+    mended = []
+    for body in [x for x in spec.bodies[1:] if x.explicitinertial and not _possible(x)]:
+        full = body.fullinertia
+        matrix = np.diag(body.inertia)
+        if not np.isnan(full[0]):
+            matrix = np.asarray(full)[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+        moments, axes = np.linalg.eigh(matrix)
+        seconds = moments.sum() / 2 - moments
+        slight = moments[0] > 0 and -seconds.min() <= SLIGHT * moments[-1]
+        heavier = max(x.mass for x in _rigid(body) if x.explicitinertial) > body.mass
+        if body.mass < 0 or not (slight or heavier):
+            listed = ", ".join(f"{x:.3g}" for x in moments)
+            raise RobotError(
+                f"body {quote(body.name)} of {body.mass:.3g} kg has principal moments of inertia "
+                f"{listed} kg m^2, which no body can have; each must be positive, and at most the "
+                "sum of the others: of a box a, b, c about a, m (b^2 + c^2) / 12"
+            )
+        seconds = np.maximum(seconds, max(0.01 * seconds.max(), 1e-6 * body.mass, 1e-12))
+        moments = seconds.sum() - seconds
+        near = axes * moments @ axes.T
+        if np.isnan(full[0]):
+            body.inertia = near.diagonal()
+        else:
+            body.fullinertia = [*near.diagonal(), near[0, 1], near[0, 2], near[1, 2]]
+        mended.append(body.name)
+    if not mended:
+        return []
+    return [
+        f"moments of inertia that no body can have, replaced by the nearest: {', '.join(mended)}"
+    ]
+
+
+def _possible(body: mujoco.MjsBody) -> bool:
+    """Whether MuJoCo takes a body's inertia."""
+    probe = mujoco.MjSpec()
+    alone = probe.worldbody.add_body(mass=body.mass, explicitinertial=True)
+    if np.isnan(body.fullinertia[0]):
+        alone.inertia = body.inertia
+    else:
+        alone.fullinertia = body.fullinertia
+    if len(_rigid(body)) == 1:  # only what moves must have a mass
+        alone.add_freejoint()
+    try:
+        probe.compile()
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,73 @@
+"""Prepares a URDF for MuJoCo: package paths, unreadable meshes, what exporters write twice."""
+
+import os
+import re
+import shlex
+from pathlib import Path
+from xml.etree import ElementTree
+
+from mjx_balance.files.text import MESSAGE, shorten
+from mjx_balance.robots.schema import RobotError
+
+
+def read(path: Path, visual: bool) -> str:
+    """Returns the XML of a URDF, with absolute paths of meshes.
+
+    Args:
+      path: of the URDF.
+      visual: whether to keep its visual shapes.
+
+    Raises:
+      RobotError: if it is no URDF, or a xacro file.
+    """
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    text = re.sub(r"<\?xml.*?\?>", "", text, count=1, flags=re.DOTALL)
+    try:
+        robot = ElementTree.fromstring(text.strip())
+    except ElementTree.ParseError as error:
+        message = shorten(error, MESSAGE)
+        if "unbound prefix" in message:
+            raise _xacro(path) from None
+        raise RobotError(f"{path.name} cannot be read: {message}") from error
+    if any("xacro" in element.tag for element in robot.iter()):
+        raise _xacro(path)
+    for shape in robot.iter("visual"):
+        for repeated in shape.findall("material")[1:]:
+            shape.remove(repeated)
+    extension = robot.find("mujoco")
+    if extension is None:
+        extension = ElementTree.SubElement(robot, "mujoco")
+    compiler = extension.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.SubElement(extension, "compiler")
+    folders = (path.parent / compiler.get("meshdir", ""), path.parent)
+    for mesh in robot.iter("mesh"):
+        mesh.set("filename", _mesh_file(mesh.get("filename", ""), folders))
+    compiler.attrib.update(strippath="false", meshdir="")
+    if visual:
+        compiler.set("discardvisual", "false")
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _mesh_file(name: str, folders: tuple[Path, Path]) -> str:
+    """The path of a mesh, or its name if there is no such file.
+
+    A package is a folder of its name above the URDF or in ROS_PACKAGE_PATH; or, under another name,
+    the folder of the URDF or the one above.
+    """
+    package, _, inside = name.removeprefix("package://").partition("/")
+    if name.startswith("package://"):
+        above = (folders[1].absolute(), *folders[1].absolute().parents)
+        roots = [x for x in above if x.name == package] + [x / package for x in above]
+        roots += [Path(x) / package for x in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if x]
+        paths = [root / inside for root in (*roots, *above[:2])]
+    else:
+        name = name.removeprefix("file://")
+        paths = [folder / part for folder in folders for part in (name, Path(name).name)]
+    return next((str(x.absolute()) for x in paths if x.is_file()), name)
+
+
+def _xacro(path: Path) -> RobotError:
+    return RobotError(
+        f"{path.name} is xacro, not URDF; expand it: `xacro {shlex.quote(path.name)} > robot.urdf`"
+    )

@@ -1,0 +1,421 @@
+"""Makers' models as they really are: what is odd in them is mended and said, or refused."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures import bodies
+
+from mjx_balance.robots.build import Build, build
+from mjx_balance.robots.draft import draft, sketch
+from mjx_balance.robots.model import model_path, read_model
+from mjx_balance.robots.schema import RobotError, parse_robot_file
+
+Edits = list[tuple[str, str]]
+TOTAL = 15.2  #: mass of `bodies.urdf_text`, kg
+LEGS = {"FL": (0.2, 0.1), "FR": (0.2, -0.1), "RL": (-0.2, 0.1), "RR": (-0.2, -0.1)}
+
+
+def drafted(folder: Path, text: str, name: str = "model.urdf", visual: bool = False) -> Build:
+    """What the draft of a model builds."""
+    (folder / name).write_text(text)
+    return build(parse_robot_file(draft(name, folder / name), folder / "drafted.toml"), visual)
+
+
+def urdf(edits: Edits = [], root: str = "trunk") -> str:  # noqa: B006
+    return bodies.edited(bodies.urdf_text(root), edits)
+
+
+def walker(legs: dict[str, tuple[float, float]] = LEGS, more: str = "", shank: str = "") -> str:
+    """An MJCF robot of 5 kg and 1 kg a leg; `more` is in its trunk, `shank` in every thigh."""
+    limbs = "".join(
+        f"""<body name="{leg}_hip" pos="{x} {y} 0"><joint name="{leg}_abduction" axis="1 0 0"
+        range="-.8 .8"/><geom size=".02" mass=".3"/><body name="{leg}_thigh"
+        pos="0 {np.copysign(0.06, y)} 0"><joint name="{leg}_flexion" axis="0 1 0" range="-1 3"/>
+        <geom size=".02" mass=".5"/>{shank.format(leg)}<body name="{leg}_calf" pos="0 0 -.2">
+        <joint name="{leg}_knee" axis="0 1 0" range="-2.7 -.8"/><geom size=".01" mass=".15"/>
+        <geom name="{leg}_foot" size=".02" pos="0 0 -.2" mass=".05"/></body></body></body>"""
+        for leg, (x, y) in legs.items()
+    )
+    return f"""<mujoco><compiler angle="radian"/><worldbody><body name="trunk"><freejoint/>
+    <geom type="box" size=".2 .1 .05" mass="5"/>{more}{limbs}</body></worldbody></mujoco>"""
+
+
+def with_constraint(model: str, constraint: str) -> str:
+    return model.replace("</mujoco>", f"<equality>{constraint}</equality></mujoco>")
+
+
+BOX = '<collision><geometry><box size="0.4 0.3 0.1"/></geometry></collision>'
+FEET = [(f'name="{leg}_tip"><inertial>', f'name="{leg}_tip"><later>') for leg in bodies.LEGS]
+
+
+def without_inertial(link: str, mass: float) -> tuple[str, str]:
+    same = " ".join(f'{i}="{0.01 * (i[1] == i[2])}"' for i in bodies.INERTIA)
+    inertial = f'<inertial><mass value="{mass}"/><inertia {same}/></inertial>'
+    return f'<link name="{link}">{inertial}', f'<link name="{link}">'
+
+
+def fixed(name: str, parent: str, content: str) -> tuple[str, str]:
+    """An edit that fixes a link to another one."""
+    joint = f'<joint name="to_{name}" type="fixed"><parent link="{parent}"/><child link="{name}"/>'
+    return "</robot>", f'<link name="{name}">{content}</link>{joint}</joint></robot>'
+
+
+WEIGHTLESS: dict[str, tuple[str, float, str]] = {
+    "root with a hull": (
+        urdf([('<link name="base"/>', f'<link name="base">{BOX}</link>')], "base"),
+        TOTAL,
+        "base",
+    ),
+    "guard of a shank": (urdf([fixed("guard", "RH_calf", BOX * 2)]), TOTAL, "guard"),
+    "feet": (
+        urdf([without_inertial(f"{leg}_tip", 0.04) for leg in bodies.LEGS]),
+        TOTAL - 4 * 0.04,
+        "LF_tip, RF_tip, LH_tip, RH_tip",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", WEIGHTLESS)
+def test_a_link_without_inertial_weighs_nothing(kind: str, tmp_path: Path) -> None:
+    """A hull of 12 litres is no 12 kg of water; the notes name it, and every link's mass."""
+    text, total, names = WEIGHTLESS[kind]
+    got = drafted(tmp_path, text)
+    assert got.robot.total_mass == pytest.approx(total)
+    assert got.robot.trunk_mass == pytest.approx(6.92)
+    assert got.notes[0] == f"links without <inertial> weigh nothing: {names}"
+    assert f"{names.split(', ')[0]} 0," in got.notes[1] + ","
+    assert "LF_thigh 1.15" in got.notes[1]
+
+
+def test_a_link_that_moves_needs_a_mass(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"link 'LF_hip' moves, but neither it .* write its mass"):
+        drafted(tmp_path, urdf([without_inertial("LF_hip", 0.68)]))
+
+
+def test_what_is_weighed_by_volume_is_said(tmp_path: Path) -> None:
+    """An MJCF box of 0.4 x 0.2 x 0.1 m without a mass weighs 8 kg there."""
+    got = drafted(tmp_path, walker().replace(' mass="5"', ""), "model.xml")
+    assert got.robot.trunk_mass == pytest.approx(8.0)
+    assert got.notes[0] == "weighed by the volume of their geoms: trunk"
+    assert drafted(tmp_path, walker(), "model.xml").notes == []
+
+
+HEXAPOD = LEGS | {"ML": (0.0, 0.1), "MR": (0.0, -0.1)}
+
+
+def test_six_legs_are_not_four(tmp_path: Path) -> None:
+    """But are, if the file leaves two of them out."""
+    (tmp_path / "model.xml").write_text(walker(HEXAPOD))
+    with pytest.raises(RobotError, match=r"6 chains that could be legs .*: leave .* --strip NAME"):
+        draft("model.xml", tmp_path / "model.xml")
+    text, problems = sketch("model.xml", tmp_path / "model.xml", ["ML_hip", "MR_hip"])
+    assert problems == []
+    robot = build(parse_robot_file(text, tmp_path / "drafted.toml")).robot
+    assert robot.total_mass == pytest.approx(9)
+    assert [leg.name for leg in robot.legs] == list(LEGS)
+
+
+@pytest.mark.parametrize(("z", "refused"), [(0.1, False), (-0.1, True)])
+def test_an_arm_is_a_leg_where_it_reaches_the_floor(
+    z: float, refused: bool, tmp_path: Path
+) -> None:
+    """An arm with a leg's axes, folded above the trunk or hanging beside the feet."""
+    arm = "".join(
+        f'<body name="arm{k}" pos=".05 0 {z}"><joint name="arm{k}" axis="{axis}"/>'
+        '<geom size=".02" mass=".1"/>'
+        for k, axis in enumerate(("1 0 0", "0 1 0", "0 1 0"))
+    )
+    (tmp_path / "model.xml").write_text(walker(more=arm + "</body>" * 3))
+    text, problems = sketch("model.xml", tmp_path / "model.xml")
+    assert bool(problems) == refused
+    assert 'strip = ["arm0", "arm1", "arm2"]' in text
+
+
+ROD = """<body name="{0}_rod"><joint name="{0}_lever" axis="0 1 0"/><geom size=".01" mass=".02"/>
+</body>"""
+CONSTRAINTS = {
+    "knee follows hip": (
+        '<joint joint1="RL_knee" joint2="RL_flexion" polycoef="0 -1 0 0 0"/>',
+        "joint constraint of 'RL_knee' and 'RL_flexion'",
+    ),
+    "locked knee": ('<joint joint1="FR_knee"/>', "joint constraint of 'FR_knee' couples"),
+    "knees alike": (
+        '<tendon tendon1="left" tendon2="right"/></equality><tendon><fixed name="left"><joint '
+        'joint="FL_knee" coef="1"/></fixed><fixed name="right"><joint joint="FR_knee" coef="1"/>'
+        "</fixed></tendon><equality>",
+        "tendon constraint of 'FL_knee' and 'FR_knee'",
+    ),
+    "a strut": ('<connect body1="FL_calf" body2="trunk" anchor="0 0 0"/>', "'FL_calf' and 'trunk'"),
+    "feet tied": ('<weld body1="FL_calf" body2="FR_calf"/>', "'FL_calf' and 'FR_calf'"),
+}
+
+
+@pytest.mark.parametrize("kind", CONSTRAINTS)
+def test_a_leg_whose_joints_are_coupled_is_refused(kind: str, tmp_path: Path) -> None:
+    """Ours would move as the maker's cannot."""
+    constraint, message = CONSTRAINTS[kind]
+    with pytest.raises(RobotError, match=message):
+        drafted(tmp_path, with_constraint(walker(), constraint), "model.xml")
+    inactive = constraint.replace("/>", ' active="false"/>', 1)
+    assert drafted(tmp_path, with_constraint(walker(), inactive), "model.xml").notes == []
+
+
+def test_a_urdfs_mimic_is_a_coupling(tmp_path: Path) -> None:
+    limit = 'lower="-2.72" upper="-0.838" effort="45.4" velocity="20"/>'
+    mimic = urdf([(limit, f'{limit}<mimic joint="LF_hip" multiplier="-2"/>')])
+    with pytest.raises(RobotError, match="constraint of 'LF_knee' and 'LF_hip' couples"):
+        drafted(tmp_path, mimic)
+
+
+def test_rods_that_close_a_linkage(tmp_path: Path) -> None:
+    """Their knees are driven directly where the rods are left out; the draft says how."""
+    rods = "".join(f'<connect body1="{x}_rod" body2="{x}_calf" anchor="-.04 0 -.2"/>' for x in LEGS)
+    (tmp_path / "model.xml").write_text(with_constraint(walker(shank=ROD), rods))
+    with pytest.raises(
+        RobotError, match="a limb of FL_abduction, FL_flexion, FL_lever, FL_knee; f"
+    ):
+        draft("model.xml", tmp_path / "model.xml")
+    text, problems = sketch("model.xml", tmp_path / "model.xml", [f"{leg}_rod" for leg in LEGS])
+    got = build(parse_robot_file(text, tmp_path / "drafted.toml"))
+    assert (problems, got.notes) == ([], [])
+    text, _ = sketch("model.xml", tmp_path / "model.xml", [f"{leg}_lever" for leg in LEGS])
+    with pytest.raises(RobotError, match=r"'FL_rod' and 'FL_calf' couples .* strip the rods that"):
+        build(parse_robot_file(text, tmp_path / "drafted.toml"))
+
+
+def test_a_constraint_elsewhere_is_left_out_and_said(tmp_path: Path) -> None:
+    load = '<body name="load"><geom size=".02" mass=".1"/></body>'
+    text = with_constraint(walker(more=load), '<weld body1="load" body2="trunk"/>')
+    notes = drafted(tmp_path, text, "model.xml").notes
+    assert notes[0] == "the weld constraint of 'load' and 'trunk' is left out"
+
+
+@pytest.mark.parametrize("model", ["spy.inner:model.xml", "spy.none:model.xml", "spy:model.xml"])
+def test_a_package_is_found_without_running_it(
+    model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor its parents."""
+    inner = tmp_path / "spy" / "inner"
+    inner.mkdir(parents=True)
+    (tmp_path / "spy" / "__init__.py").write_text("raise SystemExit('run')")
+    (inner / "model.xml").write_text(walker())
+    monkeypatch.syspath_prepend(str(tmp_path))
+    if model.startswith("spy.inner"):
+        assert model_path(model, Path()) == inner / "model.xml"
+    else:
+        with pytest.raises(RobotError, match=r"is not installed|there is no file"):
+            model_path(model, Path())
+    assert not [name for name in sys.modules if name.startswith("spy")]
+
+
+def test_a_module_is_no_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The standard library's `this` prints when it is imported."""
+    monkeypatch.delitem(sys.modules, "this", raising=False)
+    with pytest.raises(RobotError, match=r"'this\.x' is not installed"):
+        model_path("this.x:y.xml", Path())
+    assert "this" not in sys.modules
+
+
+def mesh(file: str, where: str = "visual") -> str:
+    return f'<{where}><geometry><mesh filename="{file}"/></geometry></{where}>'
+
+
+def stl(path: Path, faces: int = 4) -> None:
+    """A tetrahedron in binary STL; `faces` is what its head says."""
+    corners = 0.1 * np.asarray([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    triangles = [corners[[k for k in range(4) if k != skip]] for skip in range(4)]
+    record = b"".join(bytes(12) + x.tobytes() + bytes(2) for x in triangles)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(bytes(80) + faces.to_bytes(4, "little") + record)
+
+
+UNREADABLE = ("package://rex/meshes/trunk.stl", "gone.obj", "trunk.dae", "ascii.stl", "lies.stl")
+
+
+@pytest.mark.parametrize("file", UNREADABLE)
+def test_a_mesh_that_cannot_be_read_stops_nothing(file: str, tmp_path: Path) -> None:
+    """Neither as a shape to look at nor as one that touches: only our feet touch."""
+    (tmp_path / "trunk.dae").write_text("<COLLADA/>")
+    (tmp_path / "ascii.stl").write_text("solid trunk\n" + "facet normal 0 0 1\n" * 20)
+    stl(tmp_path / "lies.stl", faces=5)
+    inertial = '<link name="trunk"><inertial>'
+    text = urdf([(inertial, inertial.replace("<i", f"{mesh(file)}{mesh(file, 'collision')}<i"))])
+    got = drafted(tmp_path, text, visual=True)
+    assert got.robot.total_mass == pytest.approx(TOTAL)
+    assert got.notes[0].endswith(f"no readable STL, OBJ or MSH files: {Path(file).name}")
+
+
+@pytest.mark.parametrize("place", ["rex/meshes", "other/rex/meshes", "rex/urdf/meshes"])
+def test_a_package_of_meshes_is_a_folder(place: str, tmp_path: Path) -> None:
+    """Above the URDF, beside such a one, or the URDF's own under another name."""
+    stl(tmp_path / place / "trunk.stl")
+    text = urdf([('<link name="trunk">', f'<link name="trunk">{mesh(UNREADABLE[0])}')])
+    folder = tmp_path / ("other/urdf" if place.startswith("other") else "rex/urdf")
+    folder.mkdir(parents=True, exist_ok=True)
+    got = drafted(folder, text, visual=True)
+    assert (got.spec.compile().nmesh, got.notes) == (1, [])
+
+
+def test_pictures_that_are_missing_stop_nothing(tmp_path: Path) -> None:
+    """MJCF: a texture, and a mesh on a body whose mass is written; without it, it is refused."""
+    assets = """<asset><mesh name="hull" file="hull.stl"/><texture name="skin" type="2d"
+    file="skin.png"/><material name="skin" texture="skin"/></asset><worldbody>"""
+    text = walker(more='<geom type="mesh" mesh="hull" mass="0" contype="0" conaffinity="0"/>')
+    text = text.replace("<worldbody>", assets).replace('mass="5"', 'mass="5" material="skin"')
+    got = drafted(tmp_path, text, "model.xml", visual=True)
+    assert got.notes[0].endswith("files: hull.stl")
+    assert got.spec.compile().ntex == 0
+    with pytest.raises(RobotError, match=r"mesh 'hull.stl', by which body 'trunk' is weighed"):
+        drafted(tmp_path, text.replace('mesh="hull" mass="0"', 'mesh="hull"'), "model.xml")
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (("<robot ", '<robot xmlns:xacro="http://ros.org/wiki/xacro" '), None),
+        (("</robot>", '<xacro:leg name="a"/></robot>'), "is xacro, not URDF; expand it: `xacro"),
+        (("</robot>", "</link></robot>"), "cannot be read: mismatched tag"),
+        (("<robot ", '\n<?xml version="1.0"?>\n<robot '), None),
+        (("</robot>", "<!-- \u00e9 --></robot>"), None),
+    ],
+)
+def test_urdfs_as_they_are_written(
+    edit: tuple[str, str], message: str | None, tmp_path: Path
+) -> None:
+    text = urdf([edit])
+    if message is None:
+        assert drafted(tmp_path, text).robot.total_mass == pytest.approx(TOTAL)
+    else:
+        with pytest.raises(RobotError, match=message):
+            drafted(tmp_path, text)
+
+
+def inertial(mass: float, *moments: float) -> str:
+    """An inertial with ixx, iyy, izz, ixy, ixz, iyz."""
+    values = zip(bodies.INERTIA, (*moments, 0, 0, 0), strict=False)
+    words = " ".join(f'{name}="{x}"' for name, x in values)
+    return f'<inertial><mass value="{mass}"/><inertia {words}/></inertial>'
+
+
+MENDED = {
+    "a plate that is a point on the diagonal": (1e-3,) * 6,
+    "longer than wide, and more": (1e-3, 1e-3, 9e-3),
+    "negative": (1e-3, -1e-3, 1e-3),
+}
+
+
+@pytest.mark.parametrize("kind", MENDED)
+def test_an_impossible_accessory_is_mended(kind: str, tmp_path: Path) -> None:
+    """It keeps its mass, and hardly changes the moments of the trunk."""
+    text = urdf([fixed("lid", "trunk", inertial(0.1, *MENDED[kind]))])
+    got = drafted(tmp_path, text)
+    plain = drafted(tmp_path, urdf()).spec.compile()
+    assert got.robot.total_mass == pytest.approx(TOTAL + 0.1)
+    assert got.notes[0].endswith("replaced by the nearest: lid")
+    added = got.spec.compile().body("trunk").inertia - plain.body("trunk").inertia
+    assert np.abs(added).max() <= 0.01
+    assert added.sum() > 0
+
+
+def test_the_nearest_inertia(tmp_path: Path) -> None:
+    """Moments 1, 2 and 5 are those of masses 3, 2 and -1 along the axes; the last becomes none.
+
+    Without it they are 2 + 0, 3 + 0 and 3 + 2 (and 1% of the greatest, for a body has a thickness).
+    """
+    text = urdf([fixed("lid", "trunk", inertial(0.1, 1e-3, 2e-3, 5e-3))])
+    (tmp_path / "model.urdf").write_text(text)
+    lid = read_model(tmp_path / "model.urdf").spec.body("lid")
+    np.testing.assert_allclose(lid.fullinertia[:3], (2e-3, 3e-3, 5e-3), atol=4e-5)
+    np.testing.assert_allclose(lid.fullinertia[3:], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("moments", "mended"),
+    [((0.01, 0.01, 0.0205), True), ((0.01, 0.01, 0.03), False), ((0.0, 0.0, 0.0), False)],
+)
+def test_a_link_that_moves_is_mended_if_it_misses_by_little(
+    moments: tuple[float, ...], mended: bool, tmp_path: Path
+) -> None:
+    """Its third moment is the sum of the others and 2% more; 50% more is no rounding."""
+    same = " ".join(f'{i}="{0.01 * (i[1] == i[2])}"' for i in bodies.INERTIA)
+    old = f'<mass value="1.15"/><inertia {same}/>'
+    new = inertial(1.15, *moments).removeprefix("<inertial>").removesuffix("</inertial>")
+    text = urdf([(old, new)])
+    if mended:
+        assert drafted(tmp_path, text).notes[0].endswith("by the nearest: LF_thigh")
+    else:
+        with pytest.raises(RobotError, match=r"body 'LF_thigh' of 1.15 kg .* no body can have; "):
+            drafted(tmp_path, text)
+
+
+@pytest.mark.parametrize("mass", [0, 1e-6])
+def test_an_empty_root(mass: float, tmp_path: Path) -> None:
+    """As some write it for libraries that want an inertia of every root."""
+    root = f'<link name="base">{inertial(mass, *[1e-6] * 6)}</link>'
+    got = drafted(tmp_path, urdf([('<link name="base"/>', root)], "base"))
+    assert (got.robot.trunk, got.robot.trunk_mass) == ("base", pytest.approx(6.92, abs=1e-5))
+
+
+HUGE = {
+    # content of the model, or of its trunk; message
+    "ground": (
+        '<asset><hfield name="a" nrow="40000" ncol="40000" size="1 1 1 1"/></asset>',
+        r"has a height field of 1.6e\+09 points; it must have at most",
+    ),
+    "made mesh": (
+        '<asset><mesh name="a" builtin="supertorus" params="3000 1 1 1"/></asset>',
+        "has a mesh with parameter 3000; it must be at most 200",
+    ),
+    "nested repetition": (
+        '<replicate count="2000"><replicate count="2000"><site/></replicate></replicate>',
+        r"repeats elements up to 4e\+06 times",
+    ),
+    "hidden repetition": ('<replicate sep=">" count="&#57;99999"/>', "repeats elements"),
+    "bodies": ("<body/>" * 10001, r"has 100\d\d bodies; it must have at most"),
+    "name": ('<site name="a\udcff"/>', "has a name among its sites that is not UTF-8"),
+    "pipe": ('<include file="pipe"/>', "includes '.*pipe', which is no regular file"),
+    "megabytes": (f"<!--{'x' * 2**24}-->", "has more than 16 MiB of XML"),
+    "plugin": ('<plugin plugin="mujoco.elasticity.cable"/>', "plugin|cannot be read"),
+}
+
+
+@pytest.mark.parametrize("kind", HUGE)
+def test_a_model_that_would_take_the_machine_is_refused(kind: str, tmp_path: Path) -> None:
+    """In a second, and in a sentence."""
+    content, message = HUGE[kind]
+    place = "</mujoco>" if content.startswith("<asset") else "<freejoint/>"
+    text = walker().replace(place, content + place)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "model.xml").write_bytes(text.encode(errors="surrogateescape"))
+    start = time.process_time()
+    with pytest.raises(RobotError, match=message) as caught:
+        draft("model.xml", tmp_path / "model.xml")
+    assert time.process_time() - start < 3
+    assert len(str(caught.value)) <= 300
+    assert str(caught.value).isprintable()
+
+
+LARGE = {
+    "user fields": '<size nuser_geom="2000000000" nuser_body="2000000000"/>',
+    "user data": '<size nuserdata="500000000"/>',
+    "keyframes": '<size nkey="100000000"/>',
+    "memory": '<size memory="1000G"/>',
+    "constraints": '<size njmax="2000000000" nconmax="2000000000"/>',
+    "picture": (
+        '<asset><texture name="a" type="2d" builtin="flat" width="40000" height="40000"/>'
+        '<material name="a" texture="a"/></asset>'
+    ),
+    "sensor": '<sensor><user dim="500000000"/></sensor>',
+}
+
+
+@pytest.mark.parametrize("kind", LARGE)
+def test_what_is_not_the_robots_takes_no_memory(kind: str, tmp_path: Path) -> None:
+    text = walker().replace("</mujoco>", f"{LARGE[kind]}</mujoco>")
+    start = time.process_time()
+    assert drafted(tmp_path, text, "model.xml").robot.total_mass == pytest.approx(9)
+    assert time.process_time() - start < 3
