@@ -1,13 +1,16 @@
 """The run folder: file names, atomic writes, the lock, and the checks before a resume. No JAX."""
 
 import contextlib
+import errno
 import json
 import os
+import secrets
 import shutil
+import stat
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from mjx_balance.errors import InputError
 from mjx_balance.files.text import MESSAGE, shorten
@@ -18,10 +21,17 @@ else:
     import fcntl
 
 READ_AT_MOST = 2**20  #: greatest size of a JSON file of a run, bytes; usual ones have some kB
+LONGEST_LINE = 2**22  #: of metrics.jsonl, bytes; thousands of seeds fit
+PATH = 150  #: greatest length of a path in the message of `check_contained`, characters
+PART = ".mjx_balance-{}.part"  #: name of a file or folder that is not complete yet
 
 
 class RunFolderError(InputError):
     """Unusable run folder; the message says why and names a remedy."""
+
+
+class RunFolderExistsError(RunFolderError):
+    """The folder of a new run exists."""
 
 
 class RunFolder:
@@ -42,14 +52,42 @@ class RunFolder:
         self.policy = path / "policy.safetensors"
         self.evaluation = path / "evaluation.json"
         self.figures = path / "figures"
+        self.drawing = path / ".drawing"  #: there from the evaluation until the figures are drawn
         self.profile = path / "profile"  #: trace of one call of the training program, on request
         self.report = path / "report.json"  #: cached measurements of the report
+        self.page = path / "report.html"
 
     def validated_policy(self, seed: int, env_steps: int) -> Path:
         return self.validated / str(env_steps) / f"seed-{seed}.safetensors"
 
     def seed_policy(self, seed: int) -> Path:
         return self.seeds / f"seed-{seed}.safetensors"
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Opens a new file, which replaces `path` at the end of the context; follows links.
+
+    Raises:
+      OSError: if it cannot be written; the old content then stays.
+    """
+    part = None
+    try:
+        target = path.resolve()
+        # A name of its own, so that no other process writes to it and no link waits there.
+        part = target.parent / PART.format(secrets.token_hex(8))
+        with part.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(target)
+    except OSError as error:
+        error.filename = str(path)  # the user knows no other name
+        raise
+    finally:
+        if part is not None:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -61,24 +99,11 @@ def write_atomically(path: Path, content: str | bytes) -> None:
       OSError: if it cannot be written; the old content then stays.
     """
     data = content.encode() if isinstance(content, str) else content
-    part = None
-    try:
-        if path.exists() and not path.is_file() and not path.is_dir():
-            path.write_bytes(data)
-            return
-        target = path.resolve()
-        part = target.with_name(f"{target.name}.part")
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(target)
-    except OSError as error:
-        if part is not None:
-            with contextlib.suppress(OSError):
-                part.unlink()
-        error.filename = str(path)  # the user knows no .part file
-        raise
+    if path.exists() and not path.is_file() and not path.is_dir():
+        path.write_bytes(data)
+        return
+    with replacing(path) as file:
+        file.write(data)
 
 
 def write_json(path: Path, values: Any) -> None:
@@ -94,24 +119,63 @@ def create_run_folder(
     Raises:
       RunFolderError: if the folder exists or cannot be written; nothing changes then.
     """
-    if path.exists():
-        raise RunFolderError(
-            f"run folder {path} exists; choose another with --run-dir, or continue it with "
-            f"--resume {path}"
-        )
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)  # left by a dead process with the same id
+    part = path.with_name(PART.format(secrets.token_hex(8)))
     try:
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
         part.mkdir(parents=True)
         write_json(RunFolder(part).config, config)
         write_json(RunFolder(part).provenance, provenance)
         part.rename(path)
     except OSError as error:
         shutil.rmtree(part, ignore_errors=True)
+        if error.errno in (errno.EEXIST, errno.ENOTEMPTY):  # perhaps only since a moment
+            raise RunFolderExistsError(
+                f"run folder {path} exists; choose another with --run-dir, or continue it with "
+                f"--resume {path}"
+            ) from error
         raise RunFolderError(
             f"run folder {path} cannot be written: {error.strerror}; choose another with --run-dir"
         ) from error
     return RunFolder(path)
+
+
+def check_contained(path: Path) -> RunFolder:
+    """Returns a run folder if all that we read, write or delete in it lies in it.
+
+    Raises:
+      RunFolderError: for a link that leads out of the folder, and for what is neither file nor
+        folder, such as a pipe.
+    """
+    folder, root = RunFolder(path), os.path.realpath(path)
+    entries = [str(entry) for entry in vars(folder).values() if entry != path]
+    entries, known = [entry for entry in entries if os.path.lexists(entry)], set()
+    while entries:
+        entry = entries.pop()
+        try:
+            mode = os.lstat(entry).st_mode
+            if stat.S_ISLNK(mode):
+                real = os.path.realpath(entry)
+                if os.path.commonpath((root, real)) != root:
+                    raise RunFolderError(
+                        f"{shorten(entry, PATH)} is a link that leads out of the run folder; "
+                        "put a copy of its target in its place"
+                    )
+                mode = os.stat(entry).st_mode
+                if real in known:
+                    continue
+                known.add(real)
+            if stat.S_ISDIR(mode):
+                entries += (each.path for each in os.scandir(entry))
+            elif not stat.S_ISREG(mode):
+                raise RunFolderError(
+                    f"{shorten(entry, PATH)} is neither a file nor a folder; remove it"
+                )
+        except OSError as error:
+            raise RunFolderError(
+                f"{shorten(entry, PATH)} cannot be read: {error.strerror}"
+            ) from error
+    return folder
 
 
 @contextlib.contextmanager
@@ -135,10 +199,10 @@ def locked(folder: RunFolder) -> Iterator[None]:
 
 def unfinished_run(path: Path) -> RunFolder:
     """Returns the folder of a run that can be resumed; raises `RunFolderError` for any other."""
-    folder = RunFolder(path)
+    folder = check_contained(path)
     if not folder.config.is_file():
         raise RunFolderError(f"{path} is no run folder: it has no config.json")
-    if folder.evaluation.is_file():
+    if folder.evaluation.is_file() and not folder.drawing.exists():
         raise RunFolderError(f"the run in {path} is finished; start a new one with --run-dir")
     return folder
 
@@ -192,11 +256,11 @@ def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
     for name, value in today.items():
         if name != "versions" and saved.get(name) != value:
             raise RunFolderError(
-                f"{path} was started with {name} {saved.get(name)}, but it is {value} today; go "
-                "back to that, or start a new run"
+                f"{path} was started with {name} {shorten(saved.get(name))}, but it is {value} "
+                "today; go back to that, or start a new run"
             )
     changed = [
-        f"{library} {versions.get(library)} (now {version})"
+        f"{library} {shorten(versions.get(library), 20)} (now {version})"
         for library, version in today["versions"].items()
         if versions.get(library) != version
     ]
@@ -209,16 +273,19 @@ def keep_metrics_until(path: Path, env_steps: int) -> None:
     """Drops the lines of metrics that a resumed run will write again, and incomplete lines."""
     if not path.is_file():
         return
-    lines = []
-    for text in path.read_text(errors="replace").splitlines():
-        with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
-            if json.loads(text)["env_steps"] <= env_steps:
-                lines.append(f"{text}\n")
-    write_atomically(path, "".join(lines))
+    with path.open("rb") as old, replacing(path) as new:
+        while line := old.readline(LONGEST_LINE):
+            with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
+                if json.loads(line)["env_steps"] <= env_steps:
+                    new.write(line.rstrip(b"\n") + b"\n")
 
 
 def keep_validated_until(directory: Path, env_steps: int) -> None:
-    """Drops the policies that a resumed run will validate again."""
+    """Drops the policies that a resumed run will validate again, and nothing else."""
     for path in directory.glob("*"):
         if path.name.isdecimal() and int(path.name) > env_steps:
-            shutil.rmtree(path)
+            for pattern in ("seed-*.safetensors", PART.format("*")):
+                for file in path.glob(pattern):
+                    file.unlink()
+            with contextlib.suppress(OSError):  # something else is in it
+                path.rmdir()

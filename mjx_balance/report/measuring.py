@@ -17,7 +17,7 @@ from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_con
 from mjx_balance.evaluation.envelope import Envelope, envelope
 from mjx_balance.evaluation.rollout import Rollout, observing, policy_scene, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
-from mjx_balance.files.run_folder import read_json
+from mjx_balance.files.run_folder import read_json, write_atomically
 from mjx_balance.files.sources import code
 from mjx_balance.files.validation import parse
 from mjx_balance.policy.file import Policy
@@ -75,7 +75,7 @@ def load_or_measure(
             return parse_measurements(saved)
     result = _measure(policy, scene, scenarios, progress)
     with contextlib.suppress(OSError):  # a read-only folder stores nothing
-        file.write_text(json.dumps({"key": key, **dataclasses.asdict(result)}) + "\n")
+        write_atomically(file, json.dumps({"key": key, **dataclasses.asdict(result)}) + "\n")
     return result
 
 

@@ -11,7 +11,7 @@ from pydantic import WrapValidator
 
 from mjx_balance.config import Config, read_config
 from mjx_balance.errors import InputError
-from mjx_balance.files.run_folder import RunFolder, parse_json, read_json
+from mjx_balance.files.run_folder import RunFolder, check_contained, parse_json, read_json
 from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.files.validation import STRICT, parse
 from mjx_balance.policy.file import Policy, load_policy
@@ -50,6 +50,7 @@ def read_run(path: Path) -> Run:
 
     Raises:
       ReportError: if the folder does not exist or holds no part of a run.
+      RunFolderError: as `check_contained`.
     """
     folder, run = RunFolder(path), Run(path)
     parts = (folder.config, folder.metrics, folder.policy, folder.evaluation)
@@ -60,6 +61,7 @@ def read_run(path: Path) -> Run:
             f"{path} is no run folder: it has none of {', '.join(file.name for file in parts)}; "
             "`mjx-balance train` makes one"
         )
+    check_contained(path)
 
     def read(file: Path, parse: Callable[[Path], Any]) -> Any:
         if not file.is_file():

@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -19,6 +21,7 @@ from mjx_balance.files import run_folder
 from mjx_balance.files.run_folder import (
     RunFolder,
     RunFolderError,
+    RunFolderExistsError,
     check_same_provenance,
     create_run_folder,
     keep_metrics_until,
@@ -44,7 +47,7 @@ def test_a_file_is_replaced_only_once_the_new_one_is_on_disk(
     seen = []
 
     def fsync(number: int) -> None:
-        seen.append((file.read_text(), (tmp_path / "file.json.part").read_text()))
+        seen.append((file.read_text(), next(tmp_path.glob(".*.part")).read_text()))
 
     monkeypatch.setattr(os, "fsync", fsync)
     write_atomically(file, "new")
@@ -88,11 +91,9 @@ def test_links_are_followed_and_pipes_written_to(
         write_atomically(tmp_path / "there", "x")
     assert error.value.filename == str(tmp_path / "there")
     assert sorted(os.listdir(tmp_path)) == ["link", "pipe", "there"]
-    (tmp_path / "pipe.part").touch()  # somebody else's
     monkeypatch.setattr(Path, "write_bytes", mock.Mock(side_effect=OSError(32, "Broken pipe")))
     with pytest.raises(OSError, match="Broken pipe"):
         write_atomically(pipe, "x")
-    assert (tmp_path / "pipe.part").exists()
 
 
 def test_a_new_folder_has_config_and_provenance_and_nothing_beside_it(folder: RunFolder) -> None:
@@ -145,6 +146,19 @@ def test_the_names_are_those_of_the_contract(tmp_path: Path) -> None:
     assert folder.seed_policy(3) == tmp_path / "seeds" / "seed-3.safetensors"
 
 
+def test_of_two_that_create_one_folder_at_once_the_second_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It looks for the folder before the first one has created it."""
+    create_run_folder(tmp_path / "run", to_dict(CONFIG), TODAY)
+    monkeypatch.setattr(Path, "exists", lambda path: False)
+    with pytest.raises(RunFolderExistsError, match=r"run folder .*run exists; choose another"):
+        create_run_folder(tmp_path / "run", {}, {})
+    monkeypatch.undo()
+    assert read_run_config(tmp_path / "run") == CONFIG
+    assert os.listdir(tmp_path) == ["run"]
+
+
 def test_an_existing_folder_and_an_unwritable_one_are_refused(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(RunFolderError, match=r"run folder .*mine exists; choose another"):
@@ -182,6 +196,9 @@ def test_a_finished_run_and_no_run_are_told_apart(folder: RunFolder, tmp_path: P
     with pytest.raises(RunFolderError, match=r"is no run folder: it has no config\.json"):
         read_run_config(tmp_path)
     folder.evaluation.write_text("{}")
+    folder.drawing.touch()
+    assert read_run_config(folder.path) == CONFIG, "the figures are not drawn"
+    folder.drawing.unlink()
     with pytest.raises(RunFolderError, match="is finished; start a new one"):
         read_run_config(folder.path)
 
@@ -233,10 +250,152 @@ def test_validated_policies_of_a_lost_history_are_dropped(tmp_path: Path) -> Non
         file = folder.validated_policy(0, env_steps)
         file.parent.mkdir(parents=True)
         file.write_text("a policy")
-    (folder.validated / "notes").mkdir()
+    for name in ("notes", "3000", "4000"):
+        (folder.validated / name).mkdir()
+    (folder.validated / "4000" / "tax").write_text("not ours")
+    (folder.validated / "10000" / ".mjx_balance-1.part").write_text("torn")
     keep_validated_until(folder.validated, 2_048)
-    assert {path.name for path in folder.validated.iterdir()} == {"900", "2048", "notes"}
+    names = {path.name for path in folder.validated.iterdir()}
+    assert names == {"900", "2048", "notes", "4000"}
+    assert (folder.validated / "4000" / "tax").is_file()
     assert folder.validated_policy(0, 2_048).is_file()
+
+
+OUTSIDE = [
+    *("config", "provenance", "lock", "metrics", "policy", "report", "page", "sweep"),
+    *("tensorboard", "checkpoints", "validated", "seeds", "figures", "profile"),
+]
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_link_out_of_the_folder_is_refused_and_nothing_is_changed(
+    folder: RunFolder, tmp_path: Path, name: str
+) -> None:
+    """Whether it leads to a file, to a folder or to nothing yet."""
+    target = tmp_path / "mine"
+    place = getattr(folder, name)
+    for make in (lambda: target.write_text("diary"), target.mkdir, lambda: None):
+        make()
+        place.unlink(missing_ok=True)
+        place.symlink_to(Path("..") / "mine")
+        with pytest.raises(RunFolderError, match=f"{place.name} is a link that leads out of the"):
+            read_run_config(folder.path)
+        if target.is_file():
+            assert target.read_text() == "diary"
+            target.unlink()
+        elif target.is_dir():
+            target.rmdir()
+    assert not target.exists()
+
+
+@pytest.mark.parametrize(
+    ("place", "target"),
+    [
+        ("checkpoints/3000/state/d/0", "/etc/hostname"),
+        ("validated/9", "../../mine"),
+        ("seeds/seed-0.safetensors", "../../mine/policy"),
+        ("tensorboard/final", "../.."),
+        ("tensorboard/final", "../../run-2"),  # its name begins as the folder's
+    ],
+)
+def test_a_link_out_is_found_at_any_depth(folder: RunFolder, place: str, target: str) -> None:
+    link = folder.path / place
+    link.parent.mkdir(parents=True)
+    link.symlink_to(target)
+    with pytest.raises(RunFolderError, match=f"{place} is a link that leads out"):
+        read_run_config(folder.path)
+
+
+def test_links_within_the_folder_and_to_it_are_followed(folder: RunFolder, tmp_path: Path) -> None:
+    """Also where they lead in circles; what is not ours is not looked at."""
+    (folder.path / "elsewhere").mkdir()
+    (folder.path / "elsewhere" / "again").symlink_to("../elsewhere")
+    folder.validated.symlink_to("elsewhere")
+    (folder.path / "notes").symlink_to("/etc")
+    (tmp_path / "latest").symlink_to("run")
+    assert read_run_config(tmp_path / "latest") == CONFIG
+    (folder.path / "elsewhere" / "out").symlink_to("/etc")
+    with pytest.raises(RunFolderError, match="validated/out is a link that leads out"):
+        read_run_config(folder.path)
+
+
+def test_pipes_and_sockets_are_refused_at_once(folder: RunFolder) -> None:
+    for name in ("provenance", "metrics", "lock", "evaluation", "policy", "tensorboard"):
+        place = getattr(folder, name)
+        content = place.read_bytes() if place.exists() else None
+        place.unlink(missing_ok=True)
+        os.mkfifo(place)
+        with pytest.raises(RunFolderError, match=f"{place.name} is neither a file nor a folder"):
+            read_run_config(folder.path)
+        place.unlink()
+        if content is not None:
+            place.write_bytes(content)
+    folder.metrics.symlink_to("pipe")
+    os.mkfifo(folder.path / "pipe")
+    with pytest.raises(RunFolderError, match=r"metrics\.jsonl is neither a file nor a folder"):
+        read_run_config(folder.path)
+    folder.metrics.unlink()
+    folder.figures.symlink_to("figures")
+    with pytest.raises(RunFolderError, match="figures cannot be read: Too many levels of"):
+        read_run_config(folder.path)
+
+
+def test_a_place_that_cannot_be_looked_at_is_a_sentence(folder: RunFolder) -> None:
+    deep = folder.checkpoints
+    for _ in range(40):
+        deep.mkdir()
+        os.chdir(deep)
+        deep = Path("d" * 200)
+    os.chdir("/")
+    with pytest.raises(RunFolderError, match="cannot be read: File name too long") as error:
+        read_run_config(folder.path)
+    assert len(str(error.value)) <= 300
+
+
+def test_two_that_write_one_file_do_not_meet(tmp_path: Path) -> None:
+    """Every write succeeds, and a reader sees one of both contents at any time."""
+    file = tmp_path / "file"
+    file.write_text("a" * 10_000)
+
+    def write(letter: str) -> None:
+        for _ in range(40):
+            write_atomically(file, letter * 10_000)
+
+    with ThreadPoolExecutor(2) as pool:
+        writers = [pool.submit(write, letter) for letter in "ab"]
+        while not all(writer.done() for writer in writers):
+            assert file.read_text() in ("a" * 10_000, "b" * 10_000)
+        for writer in writers:
+            writer.result()
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_no_link_that_waits_is_written_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if it has the name that the new file would have."""
+    monkeypatch.setattr(run_folder.secrets, "token_hex", lambda size: "1")
+    (tmp_path / "diary").write_text("mine")
+    (tmp_path / ".mjx_balance-1.part").symlink_to("diary")
+    with pytest.raises(FileExistsError):
+        write_atomically(tmp_path / "file", "theirs")
+    assert (tmp_path / "diary").read_text() == "mine"
+
+
+def test_long_metrics_take_little_memory(tmp_path: Path) -> None:
+    """64 MiB, most of it a line without end."""
+    log = tmp_path / "metrics.jsonl"
+    with log.open("w") as file:
+        for k in range(6_000):
+            file.write(json.dumps({"env_steps": k, "x": "y" * 500}) + "\n")
+        file.truncate(2**26)
+    tracemalloc.start()
+    keep_metrics_until(log, 4_999)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**24
+    lines = log.read_text().splitlines()
+    assert (len(lines), json.loads(lines[-1])["env_steps"]) == (5_000, 4_999)
 
 
 WHOLE = json.dumps(to_dict(CONFIG)).encode()
