@@ -28,3 +28,14 @@ def quiet_imports(*unused: str) -> Iterator[None]:
     finally:
         for name in hidden:
             del sys.modules[name]
+
+
+@contextlib.contextmanager
+def matplotlib_imports() -> Iterator[None]:
+    """Import Matplotlib in here: it fails if MPLBACKEND, as of a notebook, is not installed."""
+    backend = None if "matplotlib" in sys.modules else os.environ.pop("MPLBACKEND", None)
+    yield
+    if backend is not None:
+        os.environ["MPLBACKEND"] = backend
+        with contextlib.suppress(ValueError):
+            sys.modules["matplotlib"].rcParams["backend"] = backend

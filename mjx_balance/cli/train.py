@@ -93,6 +93,7 @@ def _train(args: TrainArgs) -> int:
 
     from mjx_balance.report.progress import Display
     from mjx_balance.training import run, sizing
+    from mjx_balance.training.checkpoints import SaveError
     from mjx_balance.training.processes import find_cluster
 
     display = Display()
@@ -104,7 +105,7 @@ def _train(args: TrainArgs) -> int:
             if cluster.process_id:
                 display = Display(Console(quiet=True))
         run.train(args.config, args.run_dir, args.resume, display, cluster, args.profile)
-    except PolicyError as error:
+    except (PolicyError, SaveError) as error:
         return complain(str(error), FAILED)
     except JaxRuntimeError as error:
         explanation = sizing.explained(error)

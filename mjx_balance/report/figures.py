@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 
 from mjx_balance.config import TaskConfig
@@ -13,12 +12,16 @@ from mjx_balance.evaluation.envelope import Envelope
 from mjx_balance.evaluation.rollout import Rollout
 from mjx_balance.evaluation.suites import HEADLINE
 from mjx_balance.files.run_folder import write_atomically
+from mjx_balance.quiet import matplotlib_imports
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.attitude import roll_pitch
 from mjx_balance.task.reward import RewardInputs, reward_terms
 
-mpl.use("Agg")
-import matplotlib.pyplot as plt
+with matplotlib_imports():
+    import matplotlib as mpl
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure  # pyplot would choose a backend; these figures need none
+    from matplotlib.ticker import LogLocator
 
 BLUE, ORANGE, GREY, GREEN = "#2166ac", "#d6604d", "#777777", "#4d9221"
 SHADES = ("#b2182b", "#ef8a62", "#7f7f7f", "#1a9850", "#91cf60")
@@ -64,11 +67,10 @@ def draw_figures(
 
 
 @styled
-def png(figure: plt.Figure) -> bytes:
-    """Returns the bytes of a PNG file of the figure, and closes the figure."""
+def png(figure: Figure) -> bytes:
+    """Returns the bytes of a PNG file of the figure."""
     buffer = io.BytesIO()
     figure.savefig(buffer, bbox_inches="tight")
-    plt.close(figure)
     return buffer.getvalue()
 
 
@@ -86,7 +88,7 @@ HELD_OUT = {f"eval/{suite}/tilt_mean": f"held out, {suite}" for suite in HEADLIN
 
 
 @styled
-def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
+def learning_curves(runs: list[list[dict[str, Any]]]) -> Figure:
     """Tilt, falls, reward, loss, epsilon and speed over env steps.
 
     A line shows the median over runs and seeds, a band the extremes. Each point in the tilt panel
@@ -95,7 +97,8 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
     Args:
       runs: the lines of metrics.jsonl of each run.
     """
-    figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True)
     longest = max(runs, key=lambda run: run[-1]["env_steps"])
     steps = np.asarray([m["env_steps"] for m in longest])
     for axis, (name, title, scale) in zip(axes.flat, CURVES, strict=True):
@@ -119,15 +122,16 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> plt.Figure:
         if name == "train/tilt_deg":
             axis.yaxis.set_major_formatter("{x:g}")
             axis.yaxis.set_minor_formatter("{x:g}")
-            axis.yaxis.set_minor_locator(mpl.ticker.LogLocator(subs=(2, 5)))
+            axis.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
             _draw_held_out(axis, runs)
         if scale in ("linear", "symlog") and name != "train/reward":
             axis.set_ylim(bottom=0)
-    plt.setp(axes[-1], xlabel="thousand decisions")
+    for axis in axes[-1]:
+        axis.set_xlabel("thousand decisions")
     return figure
 
 
-def _draw_held_out(axis: plt.Axes, runs: list[list[dict[str, Any]]]) -> None:
+def _draw_held_out(axis: Axes, runs: list[list[dict[str, Any]]]) -> None:
     for (name, label), colour in zip(HELD_OUT.items(), (ORANGE, GREY), strict=True):
         points = [
             (line["env_steps"] / 1000, value)
@@ -150,12 +154,13 @@ def _seed_curves(run: list[dict[str, Any]], name: str) -> np.ndarray:
 
 
 @styled
-def reward_figure(task: TaskConfig) -> plt.Figure:
+def reward_figure(task: TaskConfig) -> Figure:
     """The reward for the tilt (paper Fig. 4) and for its change (our reading of Fig. 5)."""
     tilt = np.linspace(0, task.fail_tilt, 301)
     change = np.linspace(-2, 2, 301)
     none = np.zeros_like(tilt)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     left.plot(tilt, reward_terms(task, RewardInputs(tilt, tilt, none))["level"], color=BLUE, lw=2)
     left.set(title="instant incline (paper Eq. 4, Fig. 4)", xlabel="body tilt [deg]")
     left.set_ylabel("reward")
@@ -168,17 +173,16 @@ def reward_figure(task: TaskConfig) -> plt.Figure:
 
 
 @styled
-def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> plt.Figure:
+def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> Figure:
     """The paper's Fig. 7: board and body angles over time in plain MuJoCo.
 
     Args:
       scene: of the rollouts.
       rollouts: name -> rollout of one scenario with `qpos`; one column each.
     """
-    count, size = len(rollouts), (max(11, 6.5 * len(rollouts)), 7)
-    figure, axes = plt.subplots(
-        4, count, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
-    )
+    count = len(rollouts)
+    figure = Figure(figsize=(max(11, 6.5 * count), 7), layout="constrained")
+    axes = figure.subplots(4, count, sharex=True, sharey=True, squeeze=False)
     for column, (name, rollout) in zip(axes.T, rollouts.items(), strict=True):
         _draw_rollout(column, scene, rollout)
         column[0].set_title(
@@ -209,14 +213,15 @@ def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
 
 
 @styled
-def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figure:
+def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> Figure:
     """Share of the time in which the body tilt exceeds a value, over that value.
 
     Args:
       shares: name -> (len(edges) - 1,) share of the physics steps per bin of tilt.
       edges: (bins + 1,) bounds of the bins, deg.
     """
-    figure, axis = plt.subplots(figsize=(9, 3.8), layout="constrained")
+    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    axis = figure.subplots()
     for (name, share), colour in zip(shares.items(), (BLUE, *SHADES), strict=False):
         beyond = 1 - np.cumsum(share)
         width = 2.6 if colour == BLUE else 1.4
@@ -230,14 +235,15 @@ def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> plt.Figu
 
 
 @styled
-def envelope_figure(envelope: Envelope, limit: float) -> plt.Figure:
+def envelope_figure(envelope: Envelope, limit: float) -> Figure:
     """Fall rate and mean tilt over incline and board speed, with the physical limits.
 
     Args:
       envelope: from `evaluation.envelope`.
       limit: end of the tilt's colour scale, deg.
     """
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.4), sharey=True, layout="constrained")
+    figure = Figure(figsize=(12, 4.4), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
     maps = (
         (envelope.fall_rate, "share of the scenarios with a fall", "Reds", 1.0),
         (envelope.mean_tilt, "mean body tilt [deg]", "viridis_r", limit),

@@ -161,7 +161,7 @@ def training_pictures(runs: Sequence[Run], config: Config | None) -> dict[str, s
     return pictures
 
 
-def _picture(figure: figures.plt.Figure) -> str:
+def _picture(figure: figures.Figure) -> str:
     return base64.b64encode(figures.png(figure)).decode()
 
 

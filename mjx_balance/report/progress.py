@@ -1,8 +1,11 @@
 """Progress of a run: a live panel in a terminal, plain lines elsewhere."""
 
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any, TextIO, cast
 
 from rich import progress as bars
 from rich.console import Console, Group
@@ -29,12 +32,35 @@ WARNINGS = {
 """Displayed only if greater than 0."""
 
 
+class _Output:
+    """Standard output, whose loss ends no run: of a terminal or pipe that is closed, say."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> None:
+        self._try(self._stream.write, text)
+
+    def flush(self) -> None:
+        self._try(self._stream.flush)
+
+    def _try(self, call: Callable[..., object], *text: str) -> None:
+        try:
+            call(*text)
+        except OSError:  # this text, and all that follows, goes nowhere
+            with open(os.devnull, "w") as nowhere:
+                os.dup2(nowhere.fileno(), self._stream.fileno())
+
+
 class Display:
     """Progress of one run on a console."""
 
     def __init__(self, console: Console | None = None):
         """Writes to `console`; to standard output if None."""
-        self.console = console or Console()
+        self.console = console or Console(file=cast(TextIO, _Output(sys.stdout)))
         self._metrics: Mapping[str, float] = {}
 
     def say(self, message: str) -> None:

@@ -4,8 +4,10 @@ A checkpoint is a folder named by the decisions so far, with orbax's files in `s
 checksum of them in `sum`, which is compared before anything is read.
 """
 
+import errno
 import hashlib
 import logging
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -23,22 +25,27 @@ NEWEST = 2  #: checkpoints that stay: one, and one to fall back on
 
 
 class CheckpointError(InputError):
-    """Checkpoints that cannot be written, or of which none is whole; the message says where."""
+    """Checkpoints of which none is whole; the message says where."""
+
+
+class SaveError(CheckpointError):
+    """A checkpoint, or another file of a run, that cannot be written; the message says why."""
 
 
 def save(directory: Path, env_steps: int, state: object, processes: Processes = ALONE) -> None:
     """Writes a checkpoint of a pytree of arrays, unless one with these `env_steps` exists.
 
     Every process writes its own part of the state; the first one does the rest. Raises
-    `CheckpointError` if it cannot be written; those before it stay.
+    `SaveError` if it cannot be written; those before it stay.
     """
     path = directory / str(env_steps)
     part = path.with_suffix(".part")
 
     def begin() -> bool:
-        if path.exists():
+        if _is_ours(path):
             return False
-        shutil.rmtree(part, ignore_errors=True)
+        if _is_ours(part):  # of a process that was killed
+            shutil.rmtree(part)
         part.mkdir(parents=True)
         return True
 
@@ -54,8 +61,16 @@ def save(directory: Path, env_steps: int, state: object, processes: Processes = 
                 checkpointer.save((part / "state").resolve(), state)
             processes.broadcast(end, OSError)
     except Exception as error:  # whatever orbax raises on a full disk, say
-        reason = shorten(error, MESSAGE)
-        raise CheckpointError(f"the checkpoint {path} cannot be written: {reason}") from error
+        if processes.first and _is_ours(part):
+            shutil.rmtree(part, ignore_errors=True)
+        raise SaveError(f"the checkpoint {path} cannot be written: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    """The system's words, which orbax's libraries quote among many others; else the error's."""
+    text = str(error)
+    words = (os.strerror(number) for number in errno.errorcode)
+    return next((word for word in words if word in text), shorten(text, MESSAGE))
 
 
 def restore(
@@ -93,8 +108,16 @@ def restore(
 
 def saved_steps(directory: Path) -> list[int]:
     """Decisions after which there is a checkpoint, whole or not, ascending."""
-    names = [path.name for path in directory.glob("*")]
+    names = [path.name for path in directory.glob("*") if _is_ours(path)]
     return sorted(int(name) for name in names if name.isascii() and name.isdigit())
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether this is the folder of a checkpoint, whole or not: only such are deleted."""
+    if path.is_symlink() or not path.is_dir():
+        return False
+    names = os.listdir(path)  # orbax renames state.orbax-checkpoint-tmp
+    return not names or any(name.partition(".")[0] in ("state", "sum") for name in names)
 
 
 def _is_whole(path: Path) -> bool:
@@ -124,5 +147,5 @@ def _sum(folder: Path) -> str:
 
 
 def _checkpointer() -> ocp.Checkpointer:
-    logging.getLogger("absl").setLevel(logging.ERROR)
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # what fails is raised too
     return ocp.Checkpointer(ocp.StandardCheckpointHandler())

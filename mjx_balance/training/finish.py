@@ -1,11 +1,9 @@
 """The end of a run: a policy per seed, their evaluation, the best one, figures, a summary."""
 
+import itertools
 import json
-import shutil
 import time
 from typing import Any
-
-from tensorboardX import SummaryWriter
 
 from mjx_balance.config import Config, ConfigError, sweep_grid
 from mjx_balance.dqn import TrainState
@@ -14,12 +12,15 @@ from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.statistics import over_seeds
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import RunFolder, write_atomically, write_json
+from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.policy.file import Policy, PolicyError, load_policy, save_policy
 from mjx_balance.report import tables
 from mjx_balance.training.loop import Run
+from mjx_balance.training.tensorboard import Board
 from mjx_balance.training.validation import Results, best_validated, exports, scalars, score
 
 CHOICE_SCENARIOS = 32  #: scenarios per suite by which one of several seeds is chosen
+DRAWN_BYTES = 2**26  #: of metrics.jsonl; of more, the figures show every second line, third, ...
 FINAL = "final"  #: TensorBoard's folder of the evaluation after training
 
 
@@ -86,7 +87,7 @@ def _hand_out(folder: RunFolder, policy: Policy) -> None:
 
 
 def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
-    """Evaluates all seeds, makes the best the run's policy, and writes evaluation.json last."""
+    """Evaluates all seeds, makes the best the run's policy, writes evaluation.json, draws."""
     config, folder, console = run.config, run.folder, run.display.console
     each = [_evaluate(run, policy, config.eval_scenarios, SEEDS.final) for policy in policies]
     best = _choose(run, policies, each) if run.num_seeds > 1 else 0
@@ -95,10 +96,16 @@ def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
         write_json(folder.sweep, ranked)
         console.print(tables.sweep_table(ranked))
     results = each[best]
-    _log(results, policies[best].manifest["training"]["env_steps"], folder)
-    with run.display.phase("drawing figures"):
-        _draw(folder)
-    write_json(folder.evaluation, results)
+    folder.drawing.touch()
+    write_json(folder.evaluation, results)  # before the pictures, which may fail
+    try:
+        _log(results, policies[best].manifest["training"]["env_steps"], folder)
+        with run.display.phase("drawing figures"):
+            _draw(folder)
+    except Exception as error:
+        reason = shorten(error, MESSAGE) or type(error).__name__
+        run.display.say(f"not all figures and curves are there: {reason}")
+    folder.drawing.unlink()
     tables.print_summary(console, folder.path, results, time.perf_counter() - start_time)
     return results
 
@@ -107,7 +114,9 @@ def _draw(folder: RunFolder) -> None:
     from mjx_balance.report import figures, measuring  # matplotlib: not before learning begins
 
     policy = load_policy(folder.policy)
-    lines = [json.loads(text) for text in folder.metrics.read_text().splitlines()]
+    stride = 1 + folder.metrics.stat().st_size // DRAWN_BYTES
+    with folder.metrics.open(encoding="utf-8") as file:
+        lines = [json.loads(line) for line in itertools.islice(file, 0, None, stride)]
     rollout = measuring.record_rollout(policy, "paper", measuring.RECORD_SECONDS, SEEDS.record)
     scene = evaluation.policy_scene(policy)
     figures.draw_figures(folder.figures, lines, policy.config.task, scene, {"policy": rollout})
@@ -126,10 +135,9 @@ def _evaluate(run: Run, policy: Policy, scenarios: int, seed: int) -> Results:
 
 def _log(results: Results, env_steps: int, folder: RunFolder) -> None:
     """Gives TensorBoard the evaluation, once even if an earlier call was killed after that."""
-    shutil.rmtree(folder.tensorboard / FINAL, ignore_errors=True)
-    with SummaryWriter(str(folder.tensorboard / FINAL)) as board:
-        for name, value in scalars(results).items():
-            board.add_scalar(name, value, env_steps)
+    for earlier in (folder.tensorboard / FINAL).glob("events.*"):
+        earlier.unlink()
+    Board(folder.tensorboard / FINAL).write(env_steps, scalars(results))
 
 
 def _choose(run: Run, policies: list[Policy], each: list[Results]) -> int:

@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from tensorboardX import SummaryWriter
 
 from mjx_balance.config import Config, expand_runs
 from mjx_balance.dqn import DQN, TrainState
@@ -23,6 +23,7 @@ from mjx_balance.files.run_folder import RunFolder, keep_metrics_until, keep_val
 from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints
 from mjx_balance.training.processes import ALONE, Processes, exit_at_once
+from mjx_balance.training.tensorboard import Board
 
 T = TypeVar("T")
 
@@ -33,6 +34,7 @@ LEARNER_METRICS = {
 }
 """The learner's own metrics; an env's table is added to them."""
 ANSWER_S = 0.2  #: longest time that the user waits for an answer to an interrupt, s
+AGAIN_S = 1.0  #: signals within this time are one interrupt: schedulers send several at once, s
 STOPPING = (
     "stopping after this call and saving; interrupt again to quit at once, without what was "
     "learnt since the last checkpoint"
@@ -77,18 +79,35 @@ class Run:
 
 
 class Interrupts:
-    """Interrupts of the user: the first asks the loop to stop, a second one raises at once."""
+    """Reasons to stop: an interrupt of the user, of whom a second one raises at once, or a failure.
+
+    A terminal that closes interrupts too (SIGHUP), unless the user has said `nohup`.
+    """
+
+    failure: str | None = None  #: what could not be written
 
     def __init__(self, log_fn: Callable[[str], None]):
         """Answers by `log_fn`; use as a context."""
-        self._log_fn, self._received, self._answered = log_fn, 0, False
+        self._log_fn, self._first, self._answered = log_fn, None, False
 
     def __bool__(self) -> bool:
-        """Whether there was one."""
-        return self._received > 0
+        """Whether there is one."""
+        return self._first is not None or self.failure is not None
+
+    @contextmanager
+    def saving(self, path: Path) -> Iterator[None]:
+        """Notes what cannot be written of the run in `path`, so that the loop stops."""
+        try:
+            yield
+        except checkpoints.SaveError as error:
+            self.failure = self.failure or str(error)
+        except OSError as error:
+            self.failure = f"cannot write {error.filename or path}: {error.strerror}"
 
     def __enter__(self) -> "Interrupts":
-        numbers = (signal.SIGINT, signal.SIGTERM)
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
         self._previous = {number: signal.signal(number, self._receive) for number in numbers}
         return self
 
@@ -116,13 +135,17 @@ class Interrupts:
             except KeyboardInterrupt:
                 atexit.register(_leave, future)
                 raise
-            if self and not self._answered:  # not in the handler, which may interrupt a print
+            if (
+                self._first is not None and not self._answered
+            ):  # not in the handler, which may interrupt a print
                 self._answered = True
                 self._log_fn(STOPPING)
 
     def _receive(self, number: int, frame: object) -> None:
-        self._received += 1
-        if self._received > 1:
+        now = time.monotonic()
+        if self._first is None:
+            self._first = now
+        elif now - self._first >= AGAIN_S:
             raise KeyboardInterrupt
 
 
@@ -135,7 +158,9 @@ def _leave(call: Future[Any]) -> None:
 def learn(
     run: Run, program: Program, state: TrainState, stop: Interrupts, validate: Validate
 ) -> tuple[TrainState, float]:
-    """Calls the program until the last decision or until the user stops; saves either way.
+    """Calls the program until the last decision, or until the user or a full disk stops it.
+
+    The state is saved either way; what cannot be written is noted in `stop`.
 
     A validation comes before the line of metrics and the checkpoint of its call, so that a resumed
     run neither misses it nor logs it twice. Of several processes all call the program and save;
@@ -156,19 +181,22 @@ def learn(
             done = number(state.env_steps)
             if write is not None:
                 metrics, seeds = measured(run, raw, elapsed)
-                if validation_due(run, before, done):
-                    began = time.perf_counter()
-                    held_out = stop.run(validate, state)
-                    validating += time.perf_counter() - began
-                    metrics |= means(held_out)
-                    metrics["perf/validation_share"] = validating / (seconds + validating)
-                    seeds |= listed(held_out)
-                write(state, metrics, seeds)
+                with stop.saving(run.folder.path):
+                    if validation_due(run, before, done):
+                        began = time.perf_counter()
+                        held_out = stop.run(validate, state)
+                        validating += time.perf_counter() - began
+                        metrics |= means(held_out)
+                        metrics["perf/validation_share"] = validating / (seconds + validating)
+                        seeds |= listed(held_out)
+                    write(state, metrics, seeds)
             due = time.monotonic() - saved_at >= run.config.checkpoint_seconds
             if stop.run(any_process, due):
-                checkpoints.save(run.folder.checkpoints, done, state, run.processes)
+                with stop.saving(run.folder.path):
+                    checkpoints.save(run.folder.checkpoints, done, state, run.processes)
                 saved_at = time.monotonic()
-    checkpoints.save(run.folder.checkpoints, done, state, run.processes)
+    with stop.saving(run.folder.path):
+        checkpoints.save(run.folder.checkpoints, done, state, run.processes)
     return state, seconds
 
 
@@ -178,18 +206,17 @@ def _journal(run: Run, done: int) -> Iterator[Callable[..., None]]:
     folder = run.folder
     keep_metrics_until(folder.metrics, done)
     keep_validated_until(folder.validated, done)
-    board = SummaryWriter(  # whatever other files have after `done` no longer counts
-        str(folder.tensorboard), purge_step=done + 1, filename_suffix=f".from-{done}"
-    )
-    with folder.metrics.open("a") as log, board, run.display.training(done, run.total):
+    folder.metrics.touch()
+    # Whatever other files of TensorBoard have after `done` no longer counts.
+    board = Board(folder.tensorboard, purge_step=done + 1, suffix=f".from-{done}")
+    with run.display.training(done, run.total):
 
         def write(state: TrainState, metrics: dict[str, float], seeds: dict[str, Any]) -> None:
             steps = {name: number(getattr(state, name)) for name in ("env_steps", "gradient_steps")}
             by_seed = {"seeds": seeds} if run.num_seeds > 1 else {}
-            log.write(json.dumps(steps | metrics | by_seed) + "\n")
-            log.flush()
-            for name, value in metrics.items():
-                board.add_scalar(name, value, steps["env_steps"])
+            with folder.metrics.open("a") as log:
+                log.write(json.dumps(steps | metrics | by_seed) + "\n")
+            board.write(steps["env_steps"], metrics)
             run.display.update(steps["env_steps"], metrics)
 
         yield write

@@ -14,7 +14,7 @@ from mjx_balance.config.serialization import check_same_config, read_run_config
 from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files import run_folder
-from mjx_balance.files.run_folder import RunFolder, RunFolderError
+from mjx_balance.files.run_folder import RunFolder, RunFolderError, RunFolderExistsError
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report.progress import Display
 from mjx_balance.sim.engines.table import ENGINES
@@ -105,8 +105,15 @@ def _open_folder(
             display.say(warning)
         return resume
     name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder = run_folder.create_run_folder(run_dir or Path("runs") / name, to_dict(config), today)
-    return folder.path.absolute()
+    path, count = run_dir or Path("runs") / name, 1
+    while True:
+        try:
+            return run_folder.create_run_folder(path, to_dict(config), today).path.absolute()
+        except RunFolderExistsError:
+            if run_dir is not None:
+                raise
+            count += 1  # another run has begun in this second
+            path = path.with_name(f"{name}-{count}")
 
 
 def _announce(run: Run) -> None:
@@ -154,11 +161,11 @@ def _learn(run: Run, profile: bool) -> list[Policy]:
         policies = processes.run_on_all(
             lambda: finish.export(run, state, seconds) if processes.first else [], PolicyError
         )
+        so_far = f"the policy so far is {folder.policy}; continue with --resume {folder.path}"
+        if failure := next(filter(None, processes.gather(stop.failure)), None):
+            raise checkpoints.SaveError(f"{failure}; {so_far}")
         if processes.any(bool(stop)):
-            raise Interrupted(
-                f"stopped at {number(state.env_steps):,} decisions; the policy so far is "
-                f"{folder.policy}; continue with --resume {folder.path}"
-            )
+            raise Interrupted(f"stopped at {number(state.env_steps):,} decisions; {so_far}")
     return policies
 
 

@@ -24,7 +24,7 @@ from mjx_balance.render.drawing import VIDEO_SIZE
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.scene import load_scene, scene_dir
 from mjx_balance.training import run
-from mjx_balance.training.checkpoints import CheckpointError
+from mjx_balance.training.checkpoints import CheckpointError, SaveError
 
 SHIPPED = Path(__file__).parents[2] / "policies" / "best.safetensors"
 
@@ -82,6 +82,7 @@ def test_impossible_training_is_refused(
         (RunFolderError("it is finished"), 2, "mjx-balance: it is finished"),
         (CheckpointError("none is whole"), 2, "mjx-balance: none is whole"),
         (PolicyError("no finite numbers"), 1, "mjx-balance: no finite numbers"),
+        (SaveError("no room"), 1, "mjx-balance: no room"),
         (OSError(28, "No room", "runs/a"), 1, "mjx-balance: cannot write runs/a: No room"),
         (run.Interrupted("go on with --resume x"), 130, "go on with --resume x"),
         (KeyboardInterrupt(), 130, ""),

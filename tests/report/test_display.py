@@ -1,7 +1,11 @@
 """What a watcher of a run sees, number by number."""
 
 import io
+import os
+import pty
 import re
+import subprocess
+import sys
 import types
 from typing import Any
 
@@ -172,3 +176,36 @@ def test_messages_are_printed_as_they_are() -> None:
     message = "a path /[bold]" + "x" * 120
     display.say(message)
     assert out.getvalue() == f"{message}\n"
+
+
+@pytest.mark.parametrize("kind", ["pipe", "terminal", "full disk"])
+def test_a_run_outlives_the_reader_of_its_lines(kind: str) -> None:
+    """A pager that is left, a connection that breaks: the process goes on, and its code is its."""
+    speak = (
+        "import sys\n"
+        "from mjx_balance.report.progress import Display\n"
+        "display = Display()\n"
+        "display.say('heard')\n"
+        "sys.stdin.readline()\n"
+        "for _ in range(100):\n"
+        "    display.say('unheard ' * 1_000)\n"
+        "with display.phase('saving'), display.bar('evaluating') as bar:\n"
+        "    bar(0.5)\n"
+        "sys.exit(7)\n"
+    )
+    if kind == "full disk":
+        reader, writer = os.open(os.devnull, os.O_RDONLY), os.open("/dev/full", os.O_WRONLY)
+    else:
+        reader, writer = pty.openpty() if kind == "terminal" else os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-c", speak],
+        stdin=subprocess.PIPE,
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    os.close(writer)
+    assert os.read(reader, 5) in (b"heard", b"")
+    os.close(reader)
+    assert process.communicate(b"go on\n", timeout=60) == (None, b"")
+    assert process.returncode == 7

@@ -1,6 +1,9 @@
 """What a reader of the figures reads: values, axes, units and labels, from the drawn artists."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -237,10 +240,20 @@ def test_a_runs_figures_are_drawn_from_what_they_are_given(
     for (height, width), (tall, wide) in zip(sizes, ((6, 12), (3.4, 9), (7, 11)), strict=True):
         assert 140 * wide < width < 160 * wide, "150 dots per inch"
         assert 140 * tall < height < 160 * tall
-    assert not figures.plt.get_fignums(), "nothing stays in memory"
 
 
-@pytest.fixture(autouse=True)
-def _close_figures():
-    yield
-    figures.plt.close("all")
+@pytest.mark.parametrize("backend", ["module://of_a_notebook.backend", "pdf"])
+def test_figures_need_no_backend_of_the_user_and_leave_it_alone(backend: str) -> None:
+    """A notebook's, inherited by a command in it, is often not installed where we are."""
+    draw = (
+        "import os\n"
+        "from mjx_balance.config import preset\n"
+        "from mjx_balance.report import figures\n"
+        "assert figures.png(figures.reward_figure(preset('paper').task))[1:4] == b'PNG'\n"
+        "print(os.environ['MPLBACKEND'], figures.mpl.rcParams['backend'])\n"
+    )
+    command, environment = [sys.executable, "-c", draw], os.environ | {"MPLBACKEND": backend}
+    output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    name, used = output.stdout.split()
+    assert name == backend
+    assert backend != "pdf" or used == "pdf", "others' figures take it"

@@ -1,6 +1,8 @@
 """Checkpoints: what was saved comes back, and what is damaged is found out."""
 
 import dataclasses
+import os
+import resource
 import shutil
 import time
 from collections.abc import Callable
@@ -17,7 +19,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from mjx_balance.config import preset
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.training.checkpoints import CheckpointError, restore, save, saved_steps
+from mjx_balance.training.checkpoints import (
+    CheckpointError,
+    SaveError,
+    restore,
+    save,
+    saved_steps,
+)
 from mjx_balance.training.sizing import make_learner, size_to_device
 
 
@@ -91,6 +99,44 @@ def test_what_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "checkpoints").write_text("no folder")
     with pytest.raises(CheckpointError, match=r"checkpoints/5 cannot be written: .*Not a dir"):
         save(tmp_path / "checkpoints", 5, state_of(5))
+
+
+def test_a_full_disk_is_a_sentence_and_leaves_the_one_before(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No file may have more than 2,000 bytes, which the system refuses as it does a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000, before[1]))
+    numbers = np.random.default_rng(0).random(100_000, np.float32)  # cannot be compressed
+    try:
+        with pytest.raises(SaveError) as error:
+            save(folder, 20, State({"kernel": jnp.asarray(numbers)}, jnp.int32(20)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert str(error.value) == f"the checkpoint {folder / '20'} cannot be written: File too large"
+    assert sorted(os.listdir(folder)) == ["10", "5"]
+    assert restored(folder) == 10
+    assert not caplog.records
+
+
+def test_what_is_not_ours_is_neither_read_nor_deleted(folder: Path, tmp_path: Path) -> None:
+    """Folders with numbers for names, and one in the place of the next checkpoint."""
+    for name in ("3", "4000", "20.part"):
+        (folder / name).mkdir()
+        (folder / name / "tax").write_text("mine")
+    shutil.copytree(folder / "10", tmp_path / "elsewhere")
+    (folder / "7000").symlink_to(tmp_path / "elsewhere")
+    assert saved_steps(folder) == [5, 10]
+    assert restored(folder) == 10
+    with pytest.raises(SaveError, match="checkpoints/20 cannot be written: File exists"):
+        save(folder, 20, state_of(20))
+    save(folder, 30, state_of(30))
+    with pytest.raises(SaveError, match="checkpoints/4000 cannot be written: Directory not empty"):
+        save(folder, 4_000, state_of(4_000))
+    assert saved_steps(folder) == [10, 30]
+    for name in ("3", "4000", "20.part"):
+        assert (folder / name / "tax").read_text() == "mine"
+    assert (tmp_path / "elsewhere" / "sum").is_file()
 
 
 def test_none_is_whole(folder: Path) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from tensorboardX.proto.event_pb2 import Event
 from mjx_balance import load_policy
 from mjx_balance.config import ConfigError, preset
 from mjx_balance.evaluation.suites import SEEDS
-from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.files.run_folder import RunFolder, RunFolderError, unfinished_run
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report import figures, measuring
 from mjx_balance.training import finish
@@ -115,7 +116,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         return result(suite, falls, mean, seed)
 
     def draw(folder: RunFolder) -> None:
-        assert not folder.evaluation.exists()
+        assert folder.evaluation.exists()
         asked.append(("figures", load_policy(folder.policy).config.seed))
 
     monkeypatch.setattr(finish.evaluation, "evaluate", evaluate)
@@ -203,10 +204,11 @@ def test_a_run_killed_while_it_finishes_finishes_again(
 ) -> None:
     """It counts as finished only once all is written, and TensorBoard has it once."""
     with monkeypatch.context() as patch:
-        patch.setattr(finish, "_draw", lambda folder: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
+        patch.setattr(finish, "_draw", mock.Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
             finished(1.0)
-    assert not folder.evaluation.exists()
+    folder.config.write_text("{}")
+    unfinished_run(folder.path)
     # TensorBoard's names count seconds: two runs within one would hide a file that is left.
     for number, file in enumerate(list((folder.tensorboard / "final").iterdir())):
         file.rename(file.with_name(f"events.out.tfevents.{number}.earlier"))
@@ -222,6 +224,34 @@ def test_a_run_killed_while_it_finishes_finishes_again(
             content = content[16 + length :]
     names = ["falls", *(f"tilt_{name}" for name in ("mean", "rms", "p50", "p95", "p99", "max"))]
     assert sorted(tags) == sorted(f"eval/{s}/{n}" for s in ("paper", "corner") for n in names)
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("a backend")])
+def test_a_picture_that_fails_is_a_sentence_and_the_results_are_there(
+    error: Exception,
+    folder: RunFolder,
+    display: Any,
+    calls: list[Any],
+    monkeypatch: pytest.MonkeyPatch,
+    finished: Any,
+) -> None:
+    monkeypatch.setattr(finish, "_draw", mock.Mock(side_effect=error))
+    results = finished(1.0)
+    assert json.loads(folder.evaluation.read_text()) == results
+    assert display.lines[-1] == f"not all figures and curves are there: {error}"
+    assert calls[-1] == "summary"
+    folder.config.write_text("{}")
+    with pytest.raises(RunFolderError, match="is finished"):
+        unfinished_run(folder.path)
+
+
+def test_curves_that_cannot_be_written_lose_no_result(
+    folder: RunFolder, display: Any, finished: Any
+) -> None:
+    folder.tensorboard.write_text("no folder")
+    results = finished(1.0)
+    assert json.loads(folder.evaluation.read_text()) == results
+    assert "not all figures and curves are there: " in display.lines[-1]
 
 
 def test_a_sweep_is_ranked_by_falls_and_tilt_of_its_seeds(

@@ -11,7 +11,9 @@ import threading
 import time
 import types
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import jax.numpy as jnp
 import numpy as np
@@ -133,6 +135,7 @@ def test_every_call_is_logged_and_the_end_is_saved(
     def program(state: Any) -> Any:
         """Whoever watches the file sees every line at once."""
         assert len(logged(folder)) == int(state.env_steps) // 20
+        assert list(drawn(folder, "train/loss")) == CALLS[: len(logged(folder))]
         return step(state, RAW | {"diverged": 0.1})
 
     state, seconds = go(program)
@@ -159,6 +162,20 @@ def test_a_run_says_which_seeds_it_trains(folder: RunFolder, display: Any) -> No
     folder.config.unlink()
     with pytest.raises(RunFolderError, match=r"process 0 does not see .*; choose a folder that"):
         run_module._announce(run)
+
+
+def test_runs_that_begin_in_one_second_get_folders_of_their_own(
+    tmp_path: Path, display: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(time, "strftime", lambda pattern: "20300101-000000")
+    config, today = dataclasses.replace(PRESETS["smoke"], seed=4), {"versions": {}}
+    names = [run_module._open_folder(config, today, None, None, display).name for _ in range(3)]
+    first = "smoke-seed4-20300101-000000"
+    assert names == [first, f"{first}-2", f"{first}-3"]
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == names
+    with pytest.raises(RunFolderError, match="exists; choose another with --run-dir"):
+        run_module._open_folder(config, today, Path("runs") / first, None, display)
 
 
 def test_checkpoints_are_at_most_a_minute_old() -> None:
@@ -244,7 +261,7 @@ def killed_after(calls: int) -> Callable[[Any], Any]:
     return program
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_is_answered_while_the_call_goes_on(number: int, display: Any) -> None:
     def call(argument: int) -> int:
         os.kill(os.getpid(), number)
@@ -263,6 +280,41 @@ def test_an_interrupt_is_answered_while_the_call_goes_on(number: int, display: A
     assert signal.signal(number, before) is handler
     assert display.lines == [STOPPING]
     assert STOPPING.startswith("stopping after this call and saving; interrupt again to quit")
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (signal.SIGTERM, signal.SIGTERM),  # to the process and to its group
+        (signal.SIGHUP, signal.SIGTERM, signal.SIGTERM),
+        (signal.SIGINT, signal.SIGHUP),
+    ],
+)
+def test_signals_at_once_are_one_interrupt(
+    numbers: tuple[int, ...], folder: RunFolder, display: Any, go: Any
+) -> None:
+    def program(state: Any) -> Any:
+        for number in numbers:
+            os.kill(os.getpid(), number)
+        wait_for_answer(display)
+        return step(state)
+
+    assert int(go(program)[0].env_steps) == 20
+    assert display.lines == [STOPPING]
+    assert checkpoints.saved_steps(folder.checkpoints) == [20]
+
+
+def test_a_hangup_that_the_user_ignores_stays_ignored(display: Any) -> None:
+    """As under `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupts(display.say) as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert stop.run(lambda: 3) == 3
+            assert not stop
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def wait_for_answer(display: Any) -> None:
@@ -431,6 +483,53 @@ def test_an_interrupt_stops_after_the_call_and_its_validation_and_saves(
     assert list(held_out(folder)) == [40, 80, 100]
 
 
+@pytest.mark.parametrize("full", ["metrics", "tensorboard", "validated", "checkpoints"])
+def test_a_full_disk_stops_the_run_and_loses_nothing_that_is_learnt(
+    full: str, folder: RunFolder, display: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the third call; the policy is exported all the same."""
+    error, exported = OSError(28, "No space left on device", "the file"), []
+
+    def program(state: Any) -> Any:
+        if int(state.env_steps) == 40 and full == "metrics":
+            folder.metrics.unlink()
+            folder.metrics.symlink_to("/dev/full")
+        if int(state.env_steps) == 40 and full == "tensorboard":
+            monkeypatch.setattr(loop.Board, "write", mock.Mock(side_effect=error))
+        if int(state.env_steps) == 40 and full == "checkpoints":
+            shutil.rmtree(folder.checkpoints)
+            folder.checkpoints.write_text("no folder")
+        return step(state)
+
+    def validate(run: Run, state: Any) -> dict[str, np.ndarray]:
+        if int(state.env_steps) == 60 and full == "validated":
+            raise error
+        return {}
+
+    def export(run: Run, state: Any, seconds: float) -> list[str]:
+        exported.append(float(state.weights))
+        return ["the policy"]
+
+    changes = {"eval_every": 20, "checkpoint_seconds": 1e-9 if full == "checkpoints" else 1e9}
+    run = dataclasses.replace(run_of(**changes), folder=folder, display=display)
+    monkeypatch.setattr(run_module, "prepare", lambda *given: (start(), program))
+    monkeypatch.setattr(run_module, "validate", validate)
+    monkeypatch.setattr(run_module.finish, "export", export)
+    with pytest.raises(checkpoints.SaveError) as raised:
+        run_module._learn(run, False)
+    assert exported == [7.0]
+    reason = {
+        "metrics": f"cannot write {folder.path}: No space left on device",
+        "checkpoints": f"the checkpoint {folder.checkpoints / '60'} cannot be written: Not a dir",
+    }.get(full, "cannot write the file: No space left on device")
+    assert str(raised.value).startswith(reason)
+    so_far = f"the policy so far is {folder.policy}; continue with --resume {folder.path}"
+    assert str(raised.value).endswith(f"; {so_far}")
+    assert STOPPING not in display.lines, "nobody has interrupted"
+    if full != "checkpoints":
+        assert checkpoints.saved_steps(folder.checkpoints) == [60]
+
+
 def test_a_second_interrupt_does_not_wait_for_the_call(
     folder: RunFolder, go: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -445,7 +544,7 @@ def test_a_second_interrupt_does_not_wait_for_the_call(
 
     def validate(state: Any) -> dict[str, np.ndarray]:
         os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.3)
+        time.sleep(loop.AGAIN_S + 0.1)
         os.kill(os.getpid(), signal.SIGINT)
         goes_on.wait(20)
         return {}
