@@ -7,6 +7,7 @@ is traced from. Both caches are optional: what is damaged or cannot be written i
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import os
 import tempfile
@@ -22,6 +23,7 @@ from jax import export
 from mjx_balance.config import Config, to_dict
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.files.sources import code
+from mjx_balance.files.text import shorten
 from mjx_balance.machine import cores
 from mjx_balance.policy.manifest import installed_version
 from mjx_balance.robots.catalogue import robot_xml
@@ -47,21 +49,54 @@ XLA_DAMAGED = "Error reading persistent compilation cache entry for '"
 LogFn: TypeAlias = Callable[[str], None]  #: takes one line for the user
 
 
-def cache_dir() -> Path:
-    """Where programs are kept: $MJX_BALANCE_CACHE, or the user's cache folder."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(os.environ.get("MJX_BALANCE_CACHE") or Path(base) / "mjx_balance")
+def cache_dir(name: str = "") -> Path:
+    """Where programs are kept: in $MJX_BALANCE_CACHE, or the user's cache folder.
+
+    Args:
+      name: of a folder in it, which is created. Others cannot write to it: whoever plants a program
+        there runs code here.
+
+    Raises:
+      OSError: if there is no such folder, or what is in it may be another user's.
+    """
+    if own := os.environ.get("MJX_BALANCE_CACHE"):
+        folder = Path(own) / name
+    elif caches := os.environ.get("XDG_CACHE_HOME"):
+        folder = Path(caches) / "mjx_balance" / name
+    else:
+        try:
+            folder = Path.home() / ".cache" / "mjx_balance" / name
+        except RuntimeError as error:
+            reason = "there is none; set MJX_BALANCE_CACHE"
+            raise OSError(errno.EACCES, reason, "the user's home") from error
+    if name:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if hasattr(os, "geteuid"):
+            _check_ours(folder)
+    return folder
+
+
+def _check_ours(folder: Path) -> None:
+    """Makes a folder private; raises `OSError` if others may have written to it until now."""
+    mode = folder.stat().st_mode
+    for path in (folder, *folder.iterdir()):
+        status = path.stat() if path == folder else path.lstat()
+        if status.st_uid != os.geteuid():
+            raise OSError(errno.EACCES, "it is another user's", str(path))
+        if mode & 0o077 and status.st_mode & 0o022 and not path.is_symlink():
+            raise OSError(errno.EACCES, "other users may write to it; delete it", str(path))
+    if mode & 0o077:
+        folder.chmod(0o700)
 
 
 def enable_compilation_cache(log_fn: LogFn) -> None:
     """Turns XLA's persistent cache on for every program; call before compiling."""
-    folder = cache_dir() / "xla"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        _, folder = cache_dir("programs"), cache_dir("xla")
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        log_fn(f"nothing is cached, {folder} cannot be written: {error.strerror}")
+        log_fn(f"nothing is cached, {error.filename} cannot be used: {error.strerror}")
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
@@ -152,8 +187,8 @@ def compile_program(
         return jax.tree.leaves(state), output
 
     traced = jax.jit(flat, donate_argnums=0)
-    if key is not None:
-        path = cache_dir() / "programs" / f"{key}.stablehlo"
+    path = None if key is None else _file(key)
+    if path is not None:
         exported = _load(path, log_fn)
         if exported is None:
             ours = [export.DisabledSafetyCheck.custom_call(name) for name in ffi.registered()]
@@ -161,6 +196,13 @@ def compile_program(
             _store(path, exported, log_fn)
         traced = jax.jit(exported.call, donate_argnums=0)
     return CompiledProgram(traced.lower(leaves).compile(compiler_options()), structure)
+
+
+def _file(key: str) -> Path | None:
+    """Of a program; None without a cache, as `enable_compilation_cache` has said."""
+    with contextlib.suppress(OSError):
+        return cache_dir("programs") / f"{key}.stablehlo"
+    return None
 
 
 def _load(path: Path, log_fn: LogFn) -> export.Exported | None:
@@ -176,15 +218,14 @@ def _load(path: Path, log_fn: LogFn) -> export.Exported | None:
         return export.deserialize(bytearray(program))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
-        log_fn(f"the cached program {path} is made anew: {error}")
+    except Exception as error:  # whatever JAX raises for bytes that are no program
+        log_fn(f"the cached program {path} is made anew: {shorten(error)}")
         return None
 
 
 def _store(path: Path, exported: export.Exported, log_fn: LogFn) -> None:
     program = bytes(exported.serialize())
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, hashlib.sha256(program).digest() + program)
     except OSError as error:
         log_fn(f"the program is not cached, {path} cannot be written: {error.strerror}")

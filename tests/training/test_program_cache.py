@@ -1,10 +1,13 @@
 """The program cache: traced once, keyed by what is traced, and never in the way."""
 
 import dataclasses
+import hashlib
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -106,10 +109,90 @@ def test_a_run_works_without_a_cache_that_it_cannot_write(cache: Path) -> None:
     lines: list[str] = []
     check_run(compile_program(Counter().program, start(), "key", lines.append))
     program_cache.enable_compilation_cache(lines.append)
-    assert len(lines) == 3  # neither read nor written, nor XLA's own
-    for line in lines[1:]:
-        assert "cannot be written: Not a directory" in line
+    assert lines == [f"nothing is cached, {cache / 'programs'} cannot be used: Not a directory"]
     assert cache.read_text() == "no folder"
+
+
+def plant(cache: Path, planter: str) -> Path:
+    """A program that is not ours to run, in a cache as another user could have made it."""
+    folder = cache / "programs"
+    folder.mkdir(parents=True, mode=0o755)
+    doubled = jax.jit(lambda leaves: ([leaves[0] + 100, *leaves[1:]], {"sum": leaves[0]}))
+    program = bytes(jax.export.export(doubled)(jax.tree.leaves(start())).serialize())
+    file = folder / "key.stablehlo"
+    file.write_bytes(hashlib.sha256(program).digest() + program)
+    if planter == "in a folder of another":
+        os.chown(folder, 12_345, -1)
+    if planter == "of another":
+        os.chown(file, 12_345, -1)
+    if planter == "in a folder for all":
+        folder.chmod(0o777)
+        return folder
+    if planter == "for all":
+        file.chmod(0o666)
+    return file if "folder" not in planter else folder
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root gives away")
+@pytest.mark.parametrize(
+    ("planter", "reason"),
+    [
+        ("in a folder of another", "it is another user's"),
+        ("of another", "it is another user's"),
+        ("in a folder for all", "other users may write to it; delete it"),
+        ("for all", "other users may write to it; delete it"),
+    ],
+)
+def test_a_program_that_another_user_may_have_planted_never_runs(
+    cache: Path, planter: str, reason: str
+) -> None:
+    where, lines, counter = plant(cache, planter), [], Counter()
+    check_run(compile_program(counter.program, start(), "key", lines.append))
+    assert counter.traced == 1
+    before = jax.config.jax_compilation_cache_dir
+    program_cache.enable_compilation_cache(lines.append)
+    assert lines == [f"nothing is cached, {where} cannot be used: {reason}"]
+    assert jax.config.jax_compilation_cache_dir == before
+
+
+def test_a_cache_is_for_its_user_alone(cache: Path) -> None:
+    """Whatever the umask; an older one, which others could read, is closed."""
+    folder = cache / "programs"
+    folder.mkdir(parents=True, mode=0o755)
+    before = os.umask(0o002)
+    try:
+        compile_program(Counter().program, start(), "key", pytest.fail)
+        again = Counter()
+        check_run(compile_program(again.program, start(), "key", pytest.fail))
+    finally:
+        os.umask(before)
+    assert again.traced == 0
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("content", [b"", b"no flatbuffer", bytes(1000), b"\xff" * 1000])
+def test_what_is_no_program_is_a_miss(cache: Path, content: bytes) -> None:
+    """Though its digest is right."""
+    folder, lines, counter = program_cache.cache_dir("programs"), [], Counter()
+    (folder / "key.stablehlo").write_bytes(hashlib.sha256(content).digest() + content)
+    check_run(compile_program(counter.program, start(), "key", lines.append))
+    assert counter.traced == 1
+    [line] = lines
+    assert "is made anew: " in line
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container: no HOME, and no line in the list of users."""
+    for name in ("MJX_BALANCE_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", mock.Mock(side_effect=RuntimeError("no home")))
+    lines: list[str] = []
+    program_cache.enable_compilation_cache(lines.append)
+    check_run(compile_program(Counter().program, start(), "key", lines.append))
+    assert lines == [
+        "nothing is cached, the user's home cannot be used: there is none; set MJX_BALANCE_CACHE"
+    ]
+    assert sizing._measured_sizes() == {}
 
 
 @pytest.fixture
