@@ -1,5 +1,6 @@
 """A config as JSON, and back."""
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Mapping
@@ -45,25 +46,41 @@ def read_config(file: Path) -> Config:
 def read_run_config(path: Path) -> Config:
     """Reads the config of an unfinished run.
 
+    A robot file that is not where the config says from here has the path at which the run began.
+
     Raises:
       RunFolderError: if `path` is not a run folder, its run is finished, or its config is invalid.
     """
-    file = unfinished_run(path).config
+    folder = unfinished_run(path)
     try:
-        return read_config(file)
+        config = read_config(folder.config)
     except ValueError as error:
-        raise RunFolderError(f"{file} cannot be used: {shorten(error, MESSAGE)}") from error
+        reason = shorten(error, MESSAGE)
+        raise RunFolderError(f"{folder.config} cannot be used: {reason}") from error
+    if _is_file(config.robot) and not Path(config.robot).is_file():
+        with contextlib.suppress(ValueError, LookupError, TypeError):  # `check_same_provenance`
+            began_with = read_json(folder.provenance)["robot_file"]
+            if Path(began_with).is_file():
+                return dataclasses.replace(config, robot=began_with)
+    return config
+
+
+def _is_file(robot: str) -> bool:
+    return robot.endswith(".toml")
 
 
 def check_same_config(saved: Config, config: Config, path: Path) -> None:
     """Checks that the run in `path`, of config `saved`, is resumed with the same config.
 
+    A robot file may have moved; `check_same_provenance` compares its scene.
+
     Raises:
       RunFolderError: names the first field that differs.
     """
     before = flatten(to_dict(saved))
+    moved = _is_file(saved.robot) and _is_file(config.robot)
     for name, value in flatten(to_dict(config)).items():
-        if before[name] != value:
+        if before[name] != value and not (name == "robot" and moved):
             raise RunFolderError(
                 f"{path} was started with {name} = {before[name]}, not {value}; resume it "
                 "without that flag, or start a new run"

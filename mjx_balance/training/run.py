@@ -15,12 +15,13 @@ from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files import run_folder
 from mjx_balance.files.run_folder import RunFolder, RunFolderError, RunFolderExistsError
+from mjx_balance.machine import cores
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report.progress import Display
 from mjx_balance.sim.engines.table import ENGINES
 from mjx_balance.training import checkpoints, finish, profiling, program_cache, sizing
 from mjx_balance.training.loop import Interrupts, Program, Run, learn, number
-from mjx_balance.training.processes import Cluster, Interrupted, joined
+from mjx_balance.training.processes import Cluster, Interrupted, Processes, joined
 from mjx_balance.training.validation import validate
 
 SHARED = (ConfigError, RunFolderError, checkpoints.CheckpointError, PolicyError)
@@ -47,7 +48,7 @@ def train(
     """
     start_time = time.perf_counter()
     with joined(cluster, SHARED) as processes:
-        sizing.configure_jax(display.say, processes.cores)
+        sizing.configure_jax(display.say, _num_cores(config, resume, processes))
         sized, env, learner = processes.run_on_all(lambda: _set_up(config), ConfigError)
         if growth := sizing.describe_growth(config, sized):
             display.say(growth)
@@ -63,6 +64,12 @@ def train(
             policies = _learn(run, profile)
             processes.leave()  # what follows takes minutes of one process, and no device
             return finish.finish(run, policies, start_time) if processes.first else None
+
+
+def _num_cores(config: Config, resume: Path | None, processes: Processes) -> int:
+    """CPU cores to make devices: to resume a run, as many as it has had, which share the cores."""
+    had = (config.num_devices or 1) // processes.count if resume else 1
+    return max(processes.cores or cores(), had)
 
 
 def _set_up(config: Config) -> tuple[Config, BalanceEnv, DQN]:
@@ -105,6 +112,8 @@ def _open_folder(
             display.say(warning)
         return resume
     name = f"{config.preset}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    if config.robot.endswith(".toml"):  # for a resume from another folder
+        today = today | {"robot_file": str(Path(config.robot).absolute())}
     path, count = run_dir or Path("runs") / name, 1
     while True:
         try:

@@ -1,5 +1,6 @@
 """A run's folder: whole at every moment, refused in one sentence where it cannot be used."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -17,6 +18,7 @@ import pytest
 from hypothesis import given, settings
 
 from mjx_balance.config import Config, preset, read_run_config, to_dict
+from mjx_balance.config.serialization import check_same_config
 from mjx_balance.files import run_folder
 from mjx_balance.files.run_folder import (
     RunFolder,
@@ -228,6 +230,37 @@ def test_other_versions_give_a_warning(folder: RunFolder) -> None:
     assert warning is not None
     assert "was started with jax 0.9 (now 1); it goes on" in warning
     assert "mujoco" not in warning
+
+
+def test_a_robot_file_is_where_the_config_says_or_where_the_run_began(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "work").mkdir()
+    here, there = tmp_path / "rex.toml", tmp_path / "work" / "rex.toml"
+    there.touch()
+    config = dataclasses.replace(CONFIG, robot="rex.toml")
+    today = TODAY | {"robot_file": str(there)}
+    path = create_run_folder(tmp_path / "run", to_dict(config), today).path
+    monkeypatch.chdir(tmp_path)
+    assert read_run_config(path).robot == str(there)
+    here.touch()
+    assert read_run_config(path).robot == "rex.toml"
+    for gone in (here, there):
+        gone.unlink()
+    for unusable in (today, TODAY, today | {"robot_file": 3}, [], {"robot_file": None}):
+        RunFolder(path).provenance.write_text(json.dumps(unusable))
+        assert read_run_config(path).robot == "rex.toml", "which is an error with a name"
+    RunFolder(path).provenance.write_text("{")
+    assert read_run_config(path) == config
+
+
+def test_a_run_goes_on_with_the_same_config_but_for_the_place_of_its_robot() -> None:
+    run = Path("run")
+    here, there = (dataclasses.replace(CONFIG, robot=x) for x in ("rex.toml", "/there/rex.toml"))
+    check_same_config(here, there, run)
+    for other in (dataclasses.replace(there, seed=5), dataclasses.replace(there, robot="go1")):
+        with pytest.raises(RunFolderError, match=r"run was started with (seed = 0|robot = rex)"):
+            check_same_config(here, other, run)
 
 
 def test_metrics_are_kept_up_to_the_checkpoint(tmp_path: Path) -> None:

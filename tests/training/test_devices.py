@@ -16,6 +16,7 @@ from mjx_balance.dqn import DQNSpec
 from mjx_balance.dqn.mesh import AXIS, REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.training import program_cache, run, sizing
+from mjx_balance.training.processes import Processes
 from mjx_balance.training.sizing import check_memory, explained, make_learner, size_to_device
 
 CONFIG = preset("default")
@@ -307,3 +308,16 @@ def test_errors_of_a_running_program_are_explained_where_they_can_be() -> None:
     full = "INTERNAL: CpuCallback error: Traceback\n  x.py\nmine.WarpOverflowError: a buffer\n--"
     assert explained(jax.errors.JaxRuntimeError(full)) == "a buffer"
     assert explained(jax.errors.JaxRuntimeError("INTERNAL: something else")) is None
+
+
+def test_a_resumed_run_has_its_devices_where_there_are_fewer_cores(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of every process its share; a new run has one for each core, whatever it asks for."""
+    monkeypatch.setattr(run, "cores", lambda: 2)
+    config, here = dataclasses.replace(CONFIG, num_devices=8), Path("run")
+    assert run._num_cores(config, here, Processes()) == 8
+    assert run._num_cores(config, None, Processes()) == 2
+    assert run._num_cores(dataclasses.replace(config, num_devices=1), here, Processes()) == 2
+    assert run._num_cores(config, here, Processes(index=1, count=4, cores=1)) == 2
+    assert run._num_cores(config, here, Processes(index=1, count=4, cores=3)) == 3

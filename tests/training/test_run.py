@@ -160,6 +160,26 @@ def test_a_run_killed_at_any_moment_ends_as_an_undisturbed_one(
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be taken away")
+def test_a_run_goes_on_where_there_are_fewer_cores(
+    run: RunFolder, folder: RunFolder, start_train: Any
+) -> None:
+    """To the same bits: as many devices as before share the only core."""
+    folder = RunFolder(folder.path / "run")
+    first = start_train(*FLAGS, "--run-dir", folder.path)
+    first.interrupt(signal.SIGHUP, lambda: len(lines(folder)) > 1, code=130)
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        output = start_train("--resume", folder.path).end(0)
+    finally:
+        os.sched_setaffinity(0, before)
+    assert "resuming at" in output
+    assert load_policy(folder.policy).fingerprint == load_policy(run.policy).fingerprint
+    assert held_out(folder) == held_out(run)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
 def test_a_run_always_starts(engine: str, tmp_path: Path, start_train: Any) -> None:
     """1,024 envs on all cores reach their first gradient steps, again and again."""
