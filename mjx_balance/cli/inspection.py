@@ -2,17 +2,19 @@
 
 import itertools
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from mjx_balance.config import check, preset
+from mjx_balance.evaluation.suites import SUITES
 from mjx_balance.robots.catalogue import robot_notes
-from mjx_balance.robots.limits import authority, for_robot, greatest_incline
+from mjx_balance.robots.limits import authority, for_robot, greatest_incline, scale_ranges
 from mjx_balance.robots.measure import UNLIMITED
 from mjx_balance.robots.robot import Leg
-from mjx_balance.sim.scene import Scene, load_scene
+from mjx_balance.sim.scene import ROBOT, Scene, load_scene
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
 
@@ -20,6 +22,9 @@ MAX_CREEP = 0.01
 """Greatest speed of a robot that counts as standing still, m/s."""
 NO_TORQUE_LEFT = 0.99
 """Share of a servo's torque limit at which it has no reserve left."""
+MAX_TORQUE = 5
+"""Greatest plausible torque, relative to weight times leg; those of the shipped robots are 0.4 to
+1."""
 TILT_SECONDS, REST_SECONDS = 3.0, 1.0
 """Time in which the board turns, then in which it rests, s."""
 
@@ -117,6 +122,8 @@ def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
         f"the legs follow {reach:.1f} deg on both axes at once; the board tilts to "
         f"{task.max_incline:g}",
         _standing(scene, tilt_test),
+        _stance(scene),
+        *_implausible(scene),
     ]
 
 
@@ -141,6 +148,47 @@ def _standing(scene: Scene, tilt_test: TiltTest) -> str:
         loaded = "its model limits no torque: say hip_torque and knee_torque, in N m"
     place = f"at {scene.task.max_incline:g} deg on both axes"
     return f"{place} it {still}, level to {tilt_test.tilt:.2f} deg; {loaded}"
+
+
+def _stance(scene: Scene) -> str:
+    """Where the centre of mass is among the feet, and the push that tips the standing robot over.
+
+    A pendulum of height h tips over an edge at distance d from a speed of d sqrt(g / h).
+    """
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.stance.qpos
+    mujoco.mj_forward(scene.model, data)
+    com = data.subtree_com[scene.trunk]
+    feet = np.asarray([data.geom(f"{ROBOT}{leg.foot}").xpos for leg in scene.robot.legs])
+    ahead, left = com[:2] - feet[:, :2].mean(axis=0)
+    around = feet[np.argsort(np.arctan2(*(feet[:, :2] - feet[:, :2].mean(axis=0)).T)), :2]
+    edges = np.roll(around, -1, axis=0) - around
+    across = np.stack((edges[:, 1], -edges[:, 0]), axis=-1)
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    distance = np.abs(((com[:2] - around) * across).sum(axis=-1)).min()
+    height = com[2] - feet[:, 2].mean() + scene.robot.foot_radius
+    tips = distance * math.sqrt(-scene.model.opt.gravity[2] / height)
+    most = scale_ranges(SUITES["push"].randomization, scene.robot).push_max
+    return (
+        f"its centre of mass is {_mm(abs(ahead))} {'ahead of' if ahead > 0 else 'behind'} and "
+        f"{_mm(abs(left))} {'left' if left > 0 else 'right'} of the middle of its feet, "
+        f"{_mm(height)} above the board; a push of {tips:.2f} m/s tips it over (suite push: up to "
+        f"{most:.2f})"
+    )
+
+
+def _implausible(scene: Scene) -> Iterator[str]:
+    """Warns of torque limits that no robot of its weight has."""
+    robot = scene.robot
+    leg = float(np.mean(robot.each("thigh") + robot.each("calf")))
+    holds = robot.total_mass * -scene.model.opt.gravity[2] * leg
+    for name in ("hip_torque", "knee_torque"):
+        torque = getattr(robot, name)
+        if torque > MAX_TORQUE * holds and torque != UNLIMITED:
+            yield (
+                f"warning: {name} is {torque:g} N m, {torque / holds:.0f} times what holds the "
+                f"robot's weight at its leg's length; say {name}, in N m, in the file"
+            )
 
 
 def _limit(torque: float) -> str:

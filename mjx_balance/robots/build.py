@@ -16,7 +16,7 @@ from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.robots.measure import JOINT_ACTUATORS, check_joints, measure, pose
 from mjx_balance.robots.model import FRESH, Coupling, compile_model, model_path, read_model
 from mjx_balance.robots.robot import Robot
-from mjx_balance.robots.schema import Foot, LegFile, RobotError, RobotFile
+from mjx_balance.robots.schema import FixedJoint, Foot, LegFile, RobotError, RobotFile
 
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"
@@ -58,8 +58,7 @@ def _build(file: RobotFile, visual: bool) -> Build:
     notes += _keep_inertia(spec, trunk)
     _strip(spec, trunk, file)
     notes += _left_out(spec, couplings, file)
-    if notes:
-        notes.append(_masses(compile_model(spec)))
+    masses = _masses(compile_model(spec)) if notes else ""
     feet = {leg.name: _foot(spec, leg) for leg in file.legs}
     radius = _foot_radius(file, feet)
     spheres = _spheres(spec, feet, radius)
@@ -72,7 +71,12 @@ def _build(file: RobotFile, visual: bool) -> Build:
     check_joints(bare, file)
     if _align(spec, trunk, bare, file):
         bare = compile_model(spec)
-    robot = measure(file, bare, names, radius)
+    calves = [sphere.parent for sphere in spheres]
+    if visual and all(geom.parent in calves for geom in spec.geoms):
+        _draw_sticks(spec, bare, file, spheres)
+    robot = measure(file, bare, names, radius, notes)
+    if masses:
+        notes.append(masses)
     _equip(spec, robot, _imu(spec, trunk, bare, file))
     if file.board_size is not None:
         spec.add_numeric(name=BOARD_SIZE, data=[file.board_size])
@@ -111,12 +115,12 @@ def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
         spec.delete(element)
 
 
-def strip_elements(spec: mujoco.MjSpec, strip: Iterable[str], trunk: str = "") -> None:
+def strip_elements(spec: mujoco.MjSpec, strip: Iterable[str | FixedJoint], trunk: str = "") -> None:
     """Removes bodies and joints with all that refers to them.
 
     Args:
       spec: the model.
-      strip: names of bodies and joints.
+      strip: `RobotFile.strip`.
       trunk: name of the body that must stay, and stay free; none: any that is free.
 
     Raises:
@@ -129,19 +133,56 @@ def strip_elements(spec: mujoco.MjSpec, strip: Iterable[str], trunk: str = "") -
 
     names = {element.name for element in (*spec.joints, *spec.bodies)}
     fixed = not free_joints()
-    for name in strip:
+    for entry in strip:
+        name = entry.joint if isinstance(entry, FixedJoint) else entry
         if not name or name not in names:
             raise RobotError(
                 f"strip names {quote(name)}, which is no body and no joint of its model"
             )
         if name in free_joints():
             raise RobotError(f"strip names {quote(name)}, by which the trunk is free; it must be")
-        for find in (spec.body, spec.joint):  # a body takes its joints along
+        if isinstance(entry, FixedJoint):
+            _move(spec, entry)
+        finds = (spec.joint,) if isinstance(entry, FixedJoint) else (spec.body, spec.joint)
+        for find in finds:  # a body takes its joints along
             element = find(name)
             if element is not None and name != "world":
                 spec.delete(element)
         if name == "world" or not (fixed or free_joints()):
             raise RobotError(f"strip names {quote(name)}, which is, or carries, the trunk")
+
+
+def _move(spec: mujoco.MjSpec, fixed: FixedJoint) -> None:
+    """Moves a body to where its joint is to be fixed."""
+    joint = spec.joint(fixed.joint)
+    slides = joint is not None and joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+    if joint is None or not (slides or joint.type == mujoco.mjtJoint.mjJNT_HINGE):
+        raise RobotError(
+            f"strip fixes {quote(fixed.joint)} at {fixed.at:g}; it is no hinge or slide"
+        )
+    body, axis = joint.parent, joint.axis / np.linalg.norm(joint.axis)
+    quat, moved = body.quat.copy(), np.zeros(3)
+    if body.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
+        quat = np.asarray(
+            spec.resolve_orientation(
+                degree=joint.compiler.degree,
+                sequence=joint.compiler.eulerseq,
+                orientation=body.alt,
+            )
+        )
+    if slides:
+        shift = (fixed.at - joint.ref) * axis
+        mujoco.mju_rotVecQuat(moved, shift, quat)
+        body.pos = body.pos + moved
+        return
+    ref = math.radians(joint.ref) if joint.compiler.degree else joint.ref
+    turn, turned, anchor = np.zeros(4), np.zeros(4), np.zeros(3)
+    mujoco.mju_axisAngle2Quat(turn, axis, fixed.at - ref)
+    mujoco.mju_mulQuat(turned, quat, turn)
+    mujoco.mju_rotVecQuat(anchor, joint.pos, quat)
+    mujoco.mju_rotVecQuat(moved, joint.pos, turned)
+    body.pos, body.quat = body.pos + anchor - moved, turned
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 def _strip_file(spec: mujoco.MjSpec, file: RobotFile) -> None:
@@ -320,6 +361,27 @@ def _leave_geoms(spec: mujoco.MjSpec, feet: list[mujoco.MjsGeom], visual: bool) 
             element.material = ""
         for asset in (*spec.meshes, *spec.materials, *spec.textures, *spec.hfields):
             spec.delete(asset)
+
+
+def _draw_sticks(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, file: RobotFile, feet: list[mujoco.MjsGeom]
+) -> None:
+    """Draws a stick figure, from joint to joint and to the feet."""
+    for leg, foot in zip(file.legs, feet, strict=True):
+        bodies = [spec.body(file.trunk), *(spec.joint(joint).parent for joint in leg.joints)]
+        ends = [model.body(body.name).pos for body in bodies[1:]] + [model.geom(foot.name).pos]
+        for body, end in zip(bodies, ends, strict=True):
+            if np.linalg.norm(end) > model.geom(foot.name).size[0]:
+                body.add_geom(
+                    FRESH.default,
+                    type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+                    fromto=[0, 0, 0, *end],
+                    size=[model.geom(foot.name).size[0] / 2, 0, 0],
+                    mass=0,
+                    contype=0,
+                    conaffinity=0,
+                    group=VISUAL_GROUP,
+                )
 
 
 def _align(

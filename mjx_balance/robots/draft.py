@@ -92,6 +92,8 @@ def sketch(model: str, path: Path, strip: Sequence[str] = ()) -> tuple[str, list
         for joint in root.joints:
             spec.delete(joint)
         root.add_freejoint()
+        for key in list(spec.keys):  # they have no place for it
+            spec.delete(key)
     compiled = compile_model(spec, path.name)
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
@@ -266,6 +268,16 @@ def _corners(
     return corners, forward == 1
 
 
+def _fixed(model: mujoco.MjModel, joint: int) -> str:
+    """Entry of `strip` that fixes a joint where keyframe `home`, or the first, has it."""
+    name, place = _toml(model.joint(joint).name), model.jnt_qposadr[joint]
+    if not model.nkey or model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
+        return name
+    names = [model.key(k).name for k in range(model.nkey)]
+    at = model.key_qpos[names.index("home") if "home" in names else 0, place]
+    return name if at == model.qpos0[place] else f"{{ joint = {name}, at = {at:.6g} }}"
+
+
 def _render(
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -287,10 +299,10 @@ def _render(
     lines += [f"imu = {_toml(imu)}" for imu in imus if "imu" in imu.lower()][:1]
     used = {joint for leg in legs for joint in leg.joints}
     hinges = np.flatnonzero(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
-    fixed = [model.joint(int(k)).name for k in hinges if k not in used]
+    fixed = [_fixed(model, int(k)) for k in hinges if k not in used]
     if fixed or strip:
-        names = ", ".join(map(_toml, (*strip, *fixed)))
-        line = f"strip = [{names}]  # fixed; a body's name instead leaves it out"
+        entries = ", ".join((*map(_toml, strip), *fixed))
+        line = f"strip = [{entries}]  # fixed; a body's name instead leaves it out"
         lines.append(line if len(corners) == 4 else f"# {line}")
     feet = [leg.foot for leg in legs]
     radii = [foot.radius for foot in feet]

@@ -24,13 +24,19 @@ OUR_LEG, OUR_HALF_TRACK, OUR_HEIGHT = 0.426, 0.142, 0.35
 OUR_STIFFNESS, OUR_DAMPING, OUR_ARMATURE = 400.0, 16.0, 0.02
 OUR_ACTION = 0.003  # paper Eq. 3
 STRETCH = 0.77  #: standing length of the legs, of their full length: 0.35 m for ours (paper 3.1)
+GRAVITY = 9.81  #: m/s^2
+LEAST_STIFFNESS = 2.0
+"""Least stiffness of the servos, relative to weight times leg; that of ours is 6.3. Below 1.2 a
+small robot tilts by half a degree on the tilted board."""
 SMALLEST = 0.01  #: least mass and size relative to ours
 INCLINE = 7.0  #: board angle on both axes at once that the legs must compensate, deg (paper 3.1)
 
 Range = tuple[float, float]  #: least and greatest turn of a link (`Leg`), rad
 
 
-def measure(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: float) -> Robot:
+def measure(
+    file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: float, notes: list[str]
+) -> Robot:
     """Measures a robot, and scales what its file leaves out to its mass and size.
 
     Args:
@@ -38,12 +44,21 @@ def measure(file: RobotFile, model: mujoco.MjModel, feet: list[str], radius: flo
       model: compiled, x forward, with its maker's actuators.
       feet: name of each leg's foot geom.
       radius: of the feet, m.
+      notes: takes what was chosen where the model leaves it open.
 
     Raises:
       RobotError: if the kinematics of a leg do not fit, or the legs are too short for the board.
     """
-    legs = _with_corners([_leg(file, model, *one) for one in zip(file.legs, feet, strict=True)])
+    either_way: list[str] = []
+    legs = _with_corners(
+        [_leg(file, model, *one, either_way) for one in zip(file.legs, feet, strict=True)]
+    )
     _check_corners(file, legs)
+    if either_way:
+        notes.append(
+            f"knees of {', '.join(either_way)} may bend either way, and are taken to point "
+            'backward: say knee = "forward" where they do not'
+        )
     trunk = model.body(file.trunk)
     body = Body(
         name=file.name,
@@ -151,14 +166,17 @@ def _standing_height(robot: Body) -> float:
 def _gain_scale(robot: Body, height: float) -> float:
     """Servo gains relative to our own robot's.
 
-    Roll is the softest motion. A mass m at height h rolls on legs of length l and half-track y,
-    with joints of stiffness k, at a frequency proportional to sqrt(k / m) * y / (l * h). Every
-    robot gets the frequency of ours, so that its oscillation decays as early in a decision and the
-    gyro then reads the board's rate.
+    Roll is the softest motion, or pitch of a robot that is wider than long. A mass m at height h
+    rolls on legs of length l and half-track y, with joints of stiffness k, at a frequency
+    proportional to sqrt(k / m) * y / (l * h). Every robot gets the frequency of ours, so that its
+    oscillation decays as early in a decision and the gyro then reads the board's rate. Gravity
+    grows in proportion as robots get smaller; `LEAST_STIFFNESS` keeps small ones from sagging.
     """
     leg = float(np.mean([leg.thigh + leg.calf for leg in robot.legs]))
-    longer = (leg * height / robot.half_track) / (OUR_LEG * OUR_HEIGHT / OUR_HALF_TRACK)
-    return robot.total_mass / OUR_MASS * longer**2
+    narrow = min(robot.half_track, robot.half_length)
+    longer = (leg * height / narrow) / (OUR_LEG * OUR_HEIGHT / OUR_HALF_TRACK)
+    least = LEAST_STIFFNESS * robot.total_mass * GRAVITY * leg / OUR_STIFFNESS
+    return max(robot.total_mass / OUR_MASS * longer**2, least)
 
 
 def _three_digits(value: float) -> float:
@@ -170,7 +188,9 @@ def _clean(value: float) -> float:
     return round(float(value), 9) + 0.0
 
 
-def _leg(file: RobotFile, model: mujoco.MjModel, leg: LegFile, foot: str) -> Leg:
+def _leg(
+    file: RobotFile, model: mujoco.MjModel, leg: LegFile, foot: str, either_way: list[str]
+) -> Leg:
     """Measures a leg with the hip's axis level; `_with_corners` sets left and front."""
     _check_foot(model, leg, foot)
     data, tilt, signs = _level_pose(model, file.trunk, leg)
@@ -181,7 +201,7 @@ def _leg(file: RobotFile, model: mujoco.MjModel, leg: LegFile, foot: str) -> Leg
     lean, calf_lean = (math.atan2(-v[0], -v[2]) for v in (thigh, calf))
     zeros = (_clean(tilt), _clean(lean), _clean(math.remainder(calf_lean - lean, 2 * math.pi)))
     ranges = [_range(model, *one) for one in zip(leg.joints, signs, zeros, strict=True)]
-    bend, hip_turns, knee_turns = _bend(leg, ranges[1], ranges[2], lengths)
+    bend, hip_turns, knee_turns = _bend(leg, ranges[1], ranges[2], lengths, either_way)
     level_turns = _level_turns(leg, ranges[0])
     return Leg(
         name=leg.name,
@@ -267,7 +287,7 @@ def _level_turns(leg: LegFile, turns: Range) -> float:
 
 
 def _bend(
-    leg: LegFile, hip: Range, knee: Range, lengths: list[float]
+    leg: LegFile, hip: Range, knee: Range, lengths: list[float], either_way: list[str]
 ) -> tuple[Range, float, float]:
     """Bends the knee as the file says; else backward, unless forward has twice the range."""
     backward, forward = (_bend_to(side, hip, knee, lengths) for side in (-1, 1))
@@ -275,6 +295,8 @@ def _bend(
         bend = forward if leg.knee == "forward" else backward
     elif backward and forward:
         bend = forward if np.ptp(forward[0]) > 2 * np.ptp(backward[0]) else backward
+        if bend is backward and np.ptp(backward[0]) <= 2 * np.ptp(forward[0]):
+            either_way.append(leg.name)
     else:
         bend = backward or forward
     if bend is None:

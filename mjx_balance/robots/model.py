@@ -32,6 +32,8 @@ MAX_ELEMENTS = 10_000  #: greatest number of bodies, of geoms and so on
 MAX_MESH = 2**28  #: greatest size of a mesh file, bytes
 MAX_FACES = 200_000  #: of an STL file; MuJoCo reads no more
 MAX_PIXELS = 2**24  #: of a texture or height field
+MAX_DENSITY = 20_000  #: greatest plausible density of a body, kg / m^3
+HEAVY = 0.3  #: mass from which a body's density is looked at, kg
 SLIGHT = 0.05
 """Greatest share of a moment of inertia by which it may exceed the sum of the other two, and be
 mended; CAD programs round, and drop parts, by as much."""
@@ -145,7 +147,8 @@ def read_model(path: Path, visual: bool = False) -> Model:
             if not root.joints:
                 root.add_freejoint()
         notes += _weigh_links(spec)
-    return Model(spec, couplings, [*notes, *_mend_inertias(spec), *_drop_unreadable(spec)])
+    notes += [*_mend_inertias(spec), *_dense(spec), *_drop_unreadable(spec)]
+    return Model(spec, couplings, notes)
 
 
 def _parse(read: Callable[[], mujoco.MjSpec], path: Path) -> mujoco.MjSpec:
@@ -182,6 +185,7 @@ def _mujoco_message(error: Exception) -> str:
 _TAG = re.compile(
     rb"<\s*(replicate|composite|flexcomp|mesh|hfield|include|model)\b((?:[^\"'>]|\"[^\"]*\"|'[^']*')*+)"
 )
+_PERCENT = re.compile(rb"=\s*(?:\"[^\"]*?(?:%|&#)[^\"]*\"|'[^']*?(?:%|&#)[^']*')")
 _ATTRIBUTE = re.compile(r"([\w:]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
 
 
@@ -194,7 +198,12 @@ def _check_text(path: Path) -> None:
         size += file.stat().st_size
         if size > MAX_TEXT:
             raise RobotError(f"{path.name} has more than {MAX_TEXT >> 20} MiB of XML, the most")
-        for tag, attributes in _TAG.findall(file.read_bytes()):
+        text = file.read_bytes()
+        # MuJoCo hands an error's text to printf as its format: a name with %n ends the process.
+        for value in map(bytes.decode, _PERCENT.findall(text.decode(errors="replace").encode())):
+            if "%" in html.unescape(value):
+                raise RobotError(f"{path.name} has an attribute {quote(value)}; it must have no %")
+        for tag, attributes in _TAG.findall(text):
             pairs = _ATTRIBUTE.findall(html.unescape(attributes.decode(errors="replace")))
             values = {name: first or second for name, first, second in pairs}
             if tag in (b"include", b"model"):
@@ -382,6 +391,8 @@ def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
         matrix = np.diag(body.inertia)
         if not np.isnan(full[0]):
             matrix = np.asarray(full)[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+        if not np.isfinite([body.mass, *matrix.ravel()]).all():
+            raise RobotError(f"body {quote(body.name)} has an inertia that is not finite")
         moments, axes = np.linalg.eigh(matrix)
         seconds = moments.sum() / 2 - moments
         slight = moments[0] > 0 and -seconds.min() <= SLIGHT * moments[-1]
@@ -406,6 +417,24 @@ def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
     return [
         f"moments of inertia that no body can have, replaced by the nearest: {', '.join(mended)}"
     ]
+
+
+def _dense(spec: mujoco.MjSpec) -> list[str]:
+    """Names bodies whose moments of inertia are too small for their mass, whatever their shape.
+
+    Of all bodies with a sum of moments, a ball has the greatest volume: its radius is
+    sqrt(5 / 6 * sum / mass).
+    """
+    dense = []
+    for body in [x for x in spec.bodies[1:] if x.explicitinertial and x.mass > HEAVY]:
+        full = body.fullinertia
+        moments = sum(body.inertia if np.isnan(full[0]) else full[:3])
+        volume = 4 / 3 * np.pi * (5 / 6 * moments / body.mass) ** 1.5
+        if body.mass > MAX_DENSITY * volume:
+            dense.append(f"{body.name} {body.mass:.3g} kg")
+    if not dense:
+        return []
+    return [f"denser than any metal, by their moments of inertia: {', '.join(dense)}"]
 
 
 def _possible(body: mujoco.MjsBody) -> bool:

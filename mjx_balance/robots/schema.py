@@ -36,6 +36,16 @@ class Foot:
 
 
 @dataclasses.dataclass(frozen=True)
+class FixedJoint:
+    """A joint to fix at another position than 0."""
+
+    __pydantic_config__ = STRICT
+
+    joint: Name  #: a hinge or a slide
+    at: Number  #: its position in its maker's model, rad or m
+
+
+@dataclasses.dataclass(frozen=True)
 class LegFile:
     """A leg's table in the file."""
 
@@ -65,7 +75,8 @@ class RobotFile:
     legs: Annotated[tuple[LegFile, ...], Len(4, 4)]  #: in the order of the observation
     imu: Name | Place | None = None
     """Site on the trunk, or a place in its frame, m; none: the trunk's origin."""
-    strip: tuple[Name, ...] = ()  #: bodies to remove, with their descendants, and joints to fix
+    strip: tuple[Name | FixedJoint, ...] = ()
+    """Bodies to remove, with their descendants, and joints to fix, at 0 or elsewhere."""
     foot_radius: Positive | None = None  #: m; none: from the sphere geoms of the feet
     foot_friction: Positive = 0.8  #: sliding friction of a foot on the board
     hip_torque: Positive | None = None
@@ -90,7 +101,7 @@ REMEDIES = {
     "joints": "name three: abduction, hip, knee",
     "foot": "be a geom, site or body, or { body = ..., offset = [x, y, z] }, in m",
     "imu": "be a site, or a place [x, y, z] in m",
-    "strip": "list bodies and joints",
+    "strip": "list bodies and joints, by name or as { joint = ..., at = 0.5 }, in rad or m",
 }
 
 

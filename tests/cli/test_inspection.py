@@ -134,6 +134,33 @@ def test_torques_that_nobody_limits_are_asked_for(spot: tuple[Scene, TiltTest]) 
     assert "%" not in line
 
 
+def test_what_the_stance_can_bear() -> None:
+    """A pendulum tips over the nearest edge of the feet's rectangle from d sqrt(g / h)."""
+    scene, got = inspect("quadruped")
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = scene.stance.qpos
+    mujoco.mj_kinematics(model, data)
+    parts = [k for k in range(model.nbody) if model.body(k).name.startswith("robot/")]
+    com = np.average(data.xipos[parts], axis=0, weights=model.body_mass[parts])
+    feet = np.asarray([data.geom(f"robot/{leg.foot}").xpos for leg in scene.robot.legs])
+    (back, right, _), (front, left, _) = feet.min(axis=0), feet.max(axis=0)
+    edge = min(com[0] - back, front - com[0], com[1] - right, left - com[1])
+    speed = edge * np.sqrt(9.81 / com[2])
+    line = describe(scene, got)[12]
+    assert f"a push of {speed:.2f} m/s tips it over (suite push: up to 0.40)" in line
+    assert f"{1000 * com[2]:.0f} mm above the board" in line
+    assert "mm behind and 0 mm" in line
+
+
+def test_torques_that_no_robot_has_are_said(spot: tuple[Scene, TiltTest]) -> None:
+    """Spot's weight at its leg's length is 50.34 * 9.81 * 0.6575 = 325 N m."""
+    scene, got = spot
+    assert not [line for line in describe(scene, got) if line.startswith("warning")]
+    robot = dataclasses.replace(scene.robot, knee_torque=3250.0)
+    lines = describe(dataclasses.replace(scene, robot=robot), got)
+    assert lines[-1].startswith("warning: knee_torque is 3250 N m, 10 times what holds")
+
+
 def test_places_are_seen_from_the_trunks_origin(spot: tuple[Scene, TiltTest]) -> None:
     """Though it lies behind the hind legs."""
     scene, got = spot

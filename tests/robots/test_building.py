@@ -16,7 +16,14 @@ from mjx_balance.cli.inspection import tilt_board
 from mjx_balance.config import ConfigError, check, from_dict, preset
 from mjx_balance.evaluation.controllers import make_controller, measure_response
 from mjx_balance.evaluation.rollout import run_suite
-from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, robot_spec, robot_xml
+from mjx_balance.robots.catalogue import (
+    Robot,
+    RobotError,
+    find_robot,
+    robot_notes,
+    robot_spec,
+    robot_xml,
+)
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import ROBOT, Scene, load_scene
@@ -221,6 +228,31 @@ def test_rules_of_size_by_hand() -> None:
     servos = (robot.servo_stiffness, robot.servo_damping, robot.servo_armature)
     assert servos == pytest.approx((400 * 21.66, 16 * 21.66, 0.02 * 21.66), rel=2e-3)
     assert (robot.mass_scale, robot.size_scale) == (5.493, 1.702)
+
+
+@pytest.mark.parametrize(("size", "stiffness"), [(0.5, 400 / 2**5), (0.25, 0.496), (0.22, 0.298)])
+def test_small_robots_do_not_sag(size: float, stiffness: float, tmp_path: Path) -> None:
+    """Equal frequencies take 400 size^5; weight times leg is 15.2 size^3 * 9.81 * 0.426 size.
+
+    Twice that is 0.496 at a quarter of our size, and 0.298 at 0.22 of it.
+    """
+    robot = find_robot(bodies.write_robot(tmp_path, bodies.scaled(bodies.our_spec(), size)))
+    assert robot.servo_stiffness == pytest.approx(stiffness, rel=0.01)
+    assert robot.servo_damping / robot.servo_stiffness == pytest.approx(16 / 400, rel=0.01)
+    assert robot.servo_armature / robot.servo_stiffness == pytest.approx(0.02 / 400, rel=0.01)
+
+
+@pytest.mark.parametrize(("x", "stiffness"), [("0.1", 400 * 1.42**2), ("0.04", 400 * 3.55**2)])
+def test_a_robot_wider_than_long_pitches_softest(x: str, stiffness: float, tmp_path: Path) -> None:
+    """Its feet are 0.142 m aside and x ahead; at 0.04 its hips, too, are further apart aside."""
+    edits = [(f'_hip" pos="{sign}0.193', f'_hip" pos="{sign}{x}') for sign in ("", "", "-", "-")]
+    robot = find_robot(bodies.write_robot(tmp_path, edits))
+    assert robot.servo_stiffness == pytest.approx(stiffness, rel=0.01)
+    assert [(leg.left, leg.front) for leg in robot.legs] == [
+        (leg.left, leg.front) for leg in find_robot("quadruped").legs
+    ]
+    text = draft("model.xml", tmp_path / "model.xml")
+    assert "LF_abduction" in text.partition("[legs.FL]")[2].partition("[legs.FR]")[0]
 
 
 def test_the_board_grows_with_the_robot() -> None:
@@ -457,8 +489,16 @@ def test_which_way_knees_point(kind: str, tmp_path: Path) -> None:
     """By their limits; all backward if they can do both, but for what the file says."""
     edits, turns = KNEES[kind]
     said = dict.fromkeys(("LF", "RF"), 'knee = "forward"') if kind.endswith("file") else {}
-    scene = scene_of(bodies.write_robot(tmp_path, edits, **said))
+    name = bodies.write_robot(tmp_path, edits, **said)
+    scene = scene_of(name)
     np.testing.assert_allclose(scene.robot.each("knee"), turns, atol=2e-3)
+    open_to_both = kind in ("none to speak of", "alike both ways", "right ones turn the other way")
+    unsaid = [leg.name for leg in scene.robot.legs if open_to_both or leg.name not in said]
+    notes = [x for x in robot_notes(name) if x.startswith("knees of ")]
+    if open_to_both or said:
+        assert notes[0].startswith(f"knees of {', '.join(unsaid)} may bend either way")
+    else:
+        assert notes == []
     check_kinematics(scene)
 
 

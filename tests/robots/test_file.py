@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from mjx_balance.robots.catalogue import SHIPPED, RobotError, find_robot, robot_file, shipped
-from mjx_balance.robots.schema import Foot, LegFile, RobotFile, read_robot_file
+from mjx_balance.robots.schema import FixedJoint, Foot, LegFile, RobotFile, read_robot_file
 
 TEXT = """
 model = "rex.xml"
@@ -54,9 +54,17 @@ def test_everything_is_read(tmp_path: Path) -> None:
     assert [leg.knee for leg in got.legs] == [None, None, "forward", None]
 
 
+def test_a_joint_is_fixed_somewhere(tmp_path: Path) -> None:
+    got = read(tmp_path, TEXT.replace('["head"]', '["head", { joint = "jaw", at = -0.5 }]'))
+    assert got.strip == ("head", FixedJoint("jaw", -0.5))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
+        ('["head"]', '[{ joint = "jaw" }]', "strip"),
+        ('["head"]', '[{ joint = "jaw", at = "up" }]', "strip"),
+        ('["head"]', '[{ joint = "jaw", at = inf }]', "strip"),
         ('trunk = "torso"', "", "trunk is missing"),
         ('"rex.xml"', "3", "model is 3; it must be a name"),
         ("strip =", "stripe =", r"unknown field 'stripe' in RobotFile; did you mean strip\?"),

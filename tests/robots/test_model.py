@@ -5,6 +5,7 @@ import sys
 import time
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from fixtures import bodies
@@ -379,6 +380,8 @@ HUGE = {
     "name": ('<site name="a\udcff"/>', "has a name among its sites that is not UTF-8"),
     "pipe": ('<include file="pipe"/>', "includes '.*pipe', which is no regular file"),
     "megabytes": (f"<!--{'x' * 2**24}-->", "has more than 16 MiB of XML"),
+    "format": ('<site class="%s%n"/>', "has an attribute .*; it must have no %"),
+    "hidden format": ("<site class='&#37;n'/>", "has an attribute .*; it must have no %"),
     "plugin": ('<plugin plugin="mujoco.elasticity.cable"/>', "plugin|cannot be read"),
 }
 
@@ -419,3 +422,86 @@ def test_what_is_not_the_robots_takes_no_memory(kind: str, tmp_path: Path) -> No
     start = time.process_time()
     assert drafted(tmp_path, text, "model.xml").robot.total_mass == pytest.approx(9)
     assert time.process_time() - start < 3
+
+
+ARM = """<body name="lift" pos=".1 0 .05"><joint name="lift" type="slide" axis="0 0 2" ref=".1"/>
+<geom size=".02" mass=".3"/><body name="arm" pos=".1 0 .1" euler=".3 .2 .1"><joint name="shoulder"
+axis="0 3 1" pos="0 0 .05" ref=".4"/><geom size=".02" pos="0 .1 .2" mass=".5"/></body></body>"""
+
+
+def test_an_arm_is_fixed_where_the_file_says(tmp_path: Path) -> None:
+    """Every mass is where MuJoCo's kinematics of the whole model put it."""
+    (tmp_path / "model.xml").write_text(walker(more=ARM))
+    whole = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    data = mujoco.MjData(whole)
+    data.qpos[:3], data.qpos[whole.joint("lift").qposadr[0]] = 0, -0.05
+    data.qpos[whole.joint("shoulder").qposadr[0]] = 1.7
+    mujoco.mj_forward(whole, data)
+    text = draft("model.xml", tmp_path / "model.xml")
+    assert 'strip = ["lift", "shoulder"]' in text
+    places = '{ joint = "lift", at = -0.05 }, { joint = "shoulder", at = 1.7 }'
+    text = text.replace('"lift", "shoulder"', places)
+    fixed = build(parse_robot_file(text, tmp_path / "drafted.toml")).spec.compile()
+    posed = mujoco.MjData(fixed)
+    mujoco.mj_forward(fixed, posed)
+    np.testing.assert_allclose(posed.body("trunk").subtree_com, data.body("trunk").subtree_com)
+    first = data.body("trunk").xipos * 0
+    for name in ("trunk", "lift", "arm"):
+        first += data.body(name).xipos * whole.body(name).mass[0] / 5.8
+    np.testing.assert_allclose(posed.body("trunk").xipos, first, atol=1e-12)
+
+
+def test_a_draft_fixes_joints_where_the_keyframe_has_them(tmp_path: Path) -> None:
+    """At `home`, or else the first; by name alone where that is the model's zero."""
+    legs = "0 .7 -1.4 " * 4
+    keys = "".join(
+        f'<key name="{name}" qpos="0 0 .3 1 0 0 0 {arm} {legs}"/>'
+        for name, arm in (("up", "0 0"), ("home", ".1 -1.25"))
+    )
+    text = walker(more=ARM).replace("</mujoco>", f"<keyframe>{keys}</keyframe></mujoco>")
+    (tmp_path / "model.xml").write_text(text)
+    drafted = draft("model.xml", tmp_path / "model.xml")
+    assert 'strip = ["lift", { joint = "shoulder", at = -1.25 }]' in drafted
+    (tmp_path / "model.xml").write_text(text.replace('name="home"', 'name="a"'))
+    drafted = draft("model.xml", tmp_path / "model.xml")
+    assert 'strip = [{ joint = "lift", at = 0 }, { joint = "shoulder", at = 0 }]' in drafted
+
+
+def test_a_ball_is_fixed_nowhere_else(tmp_path: Path) -> None:
+    ball = '<body name="eye"><joint name="eye" type="ball"/><geom size=".02" mass=".1"/></body>'
+    (tmp_path / "model.xml").write_text(walker(more=ball))
+    text = draft("model.xml", tmp_path / "model.xml")
+    text = text.replace('strip = ["eye"]', 'strip = [{ joint = "eye", at = 1.0 }]')
+    with pytest.raises(RobotError, match="strip fixes 'eye' at 1; it is no hinge or slide"):
+        build(parse_robot_file(text, tmp_path / "drafted.toml"))
+
+
+def test_a_robot_without_shapes_is_a_stick_figure(tmp_path: Path) -> None:
+    """Sticks from joint to joint and to the feet; thigh and calf are 0.213 m long."""
+    text = urdf([('<collision><geometry><box size="0.3 0.1 0.1"/></geometry></collision>', "")])
+    shown = drafted(tmp_path, text, visual=True).spec.compile()
+    hidden = drafted(tmp_path, text).spec.compile()
+    sticks = shown.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+    assert (sticks.sum(), hidden.ngeom) == (16, 4)
+    lengths = np.unique(2 * shown.geom_size[sticks, 1].round(4))
+    np.testing.assert_allclose(lengths, (0.0955, np.hypot(0.193, 0.0465), 0.213), atol=2e-4)
+    assert not shown.geom_contype[sticks].any()
+    np.testing.assert_allclose(shown.body_mass, hidden.body_mass)
+
+
+def test_small_feet_of_small_calves(tmp_path: Path) -> None:
+    """A calf of 50 mm that ends in no sphere has a foot of an eighth, not of 20 mm."""
+    fixed = (
+        '"{0}_tip" type="fixed"><parent link="{0}_calf"/><child link="{0}_tip"/><origin xyz="0 0 '
+    )
+    tips = [(f"{x}-0.213", f"{x}-0.05") for x in map(fixed.format, bodies.LEGS)]
+    balls = [('<sphere radius="0.022"/>', '<box size="0.001 0.001 0.001"/>')] * 4
+    (tmp_path / "model.urdf").write_text(urdf(tips + balls))
+    assert "foot_radius = 0.0063" in draft("model.urdf", tmp_path / "model.urdf")
+
+
+def test_a_mass_that_no_body_of_its_size_has(tmp_path: Path) -> None:
+    """100 kg with moments of 0.03 kg m^2 is a ball of 16 mm; ours weighs 6.92 in the trunk."""
+    text = urdf([fixed("head", "trunk", inertial(100.0, 0.03, 0.03, 0.03))])
+    notes = drafted(tmp_path, text).notes
+    assert notes[0] == "denser than any metal, by their moments of inertia: head 100 kg"
