@@ -151,7 +151,7 @@ def _standing(scene: Scene, tilt_test: TiltTest) -> str:
 
 
 def _stance(scene: Scene) -> str:
-    """Where the centre of mass is among the feet, and the push that tips the standing robot over.
+    """Where the centre of mass is among the feet, and the push that tips the robot over.
 
     A pendulum of height h tips over an edge at distance d from a speed of d sqrt(g / h).
     """
@@ -172,8 +172,8 @@ def _stance(scene: Scene) -> str:
     return (
         f"its centre of mass is {_mm(abs(ahead))} {'ahead of' if ahead > 0 else 'behind'} and "
         f"{_mm(abs(left))} {'left' if left > 0 else 'right'} of the middle of its feet, "
-        f"{_mm(height)} above the board; a push of {tips:.2f} m/s tips it over (suite push: up to "
-        f"{most:.2f})"
+        f"{_mm(height)} above the board; it cannot bear pushes above {tips:.2f} m/s (suite push: "
+        f"up to {most:.2f})"
     )
 
 

@@ -193,8 +193,8 @@ def _foot(model: mujoco.MjModel, data: mujoco.MjData, knee: np.ndarray, calf: li
         return float(np.linalg.norm(place - knee))
 
     geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in calf]
-    points = [p for g in geoms for p in _points(model, data, g)]
-    furthest = max(points or [data.xpos[calf[-1]]], key=distance)
+    points = np.concatenate([_points(model, data, g) for g in geoms] or [data.xpos[calf[-1:]]])
+    furthest = points[np.argmax(np.linalg.norm(points - knee, axis=1))]
 
     def select(ids: list[int], places: np.ndarray) -> int | None:
         """The furthest one that is far enough to be a foot."""
@@ -217,8 +217,8 @@ def _foot(model: mujoco.MjModel, data: mujoco.MjData, knee: np.ndarray, calf: li
     return _Foot(_offset(model, data, calf[0], place), place, radius)
 
 
-def _points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> list[np.ndarray]:
-    """A mesh's vertices, or the face centres of another geom's bounding box, in the world, m."""
+def _points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """A mesh's vertices, or face centres of another geom's box, in the world, (points, 3) m."""
     turn, centre = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
@@ -227,7 +227,7 @@ def _points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> list[np.nd
     else:
         middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
         points = middle + np.concatenate((np.diag(half), -np.diag(half)))
-    return list(centre + points @ turn.T)
+    return centre + points @ turn.T
 
 
 def _offset(model: mujoco.MjModel, data: mujoco.MjData, body: int, place: np.ndarray) -> str:

@@ -28,7 +28,9 @@ SIZES += tuple(name for name in dir(FRESH) if name.startswith("nuser_"))
 MAX_TEXT = 2**24  #: greatest size of a model's XML, with all that it includes, bytes
 MAX_COPIES = 10_000  #: greatest product of the counts that an XML asks to repeat elements by
 MAX_PARAMETER = 200  #: greatest parameter of a mesh that MuJoCo makes, such as its resolution
-MAX_ELEMENTS = 10_000  #: greatest number of bodies, of geoms and so on
+MAX_TAGS = 20_000  #: greatest number of elements in the XML
+MAX_BODIES = 1_000  #: greatest number of bodies, and of joints
+MAX_ELEMENTS = 10_000  #: greatest number of geoms, of sites and so on
 MAX_MESH = 2**28  #: greatest size of a mesh file, bytes
 MAX_FACES = 200_000  #: of an STL file; MuJoCo reads no more
 MAX_PIXELS = 2**24  #: of a texture or height field
@@ -152,10 +154,14 @@ def read_model(path: Path, visual: bool = False) -> Model:
 
 
 def _parse(read: Callable[[], mujoco.MjSpec], path: Path) -> mujoco.MjSpec:
+    warn = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)  # else a NaN in it writes MUJOCO_LOG.TXT
     try:
         return read()
-    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+    except (ValueError, RuntimeError, mujoco.FatalError, MemoryError) as error:
         raise RobotError(f"{path.name} cannot be read: {_mujoco_message(error)}") from error
+    finally:
+        mujoco.set_mju_user_warning(warn)
 
 
 def compile_model(spec: mujoco.MjSpec, subject: str = "its model") -> mujoco.MjModel:
@@ -199,6 +205,11 @@ def _check_text(path: Path) -> None:
         if size > MAX_TEXT:
             raise RobotError(f"{path.name} has more than {MAX_TEXT >> 20} MiB of XML, the most")
         text = file.read_bytes()
+        for tag, most in ((b"<body", MAX_BODIES), (b"<", 2 * MAX_TAGS)):  # MuJoCo's time is cubic
+            if text.count(tag) > most:
+                raise RobotError(
+                    f"{path.name} has {text.count(tag)} times {tag.decode()}; it may have {most}"
+                )
         # MuJoCo hands an error's text to printf as its format: a name with %n ends the process.
         for value in map(bytes.decode, _PERCENT.findall(text.decode(errors="replace").encode())):
             if "%" in html.unescape(value):
@@ -244,10 +255,9 @@ def _check_elements(spec: mujoco.MjSpec, path: Path) -> None:
     kinds = ("bodies", "geoms", "joints", "sites", "meshes", "materials", "textures", "actuators")
     for kind in (*kinds, "keys", "plugins", *REMOVED):
         elements = list(getattr(spec, kind))
-        if len(elements) > MAX_ELEMENTS:
-            raise RobotError(
-                f"{path.name} has {len(elements)} {kind}; it must have at most {MAX_ELEMENTS}"
-            )
+        most = MAX_BODIES if kind in ("bodies", "joints") else MAX_ELEMENTS
+        if len(elements) > most:
+            raise RobotError(f"{path.name} has {len(elements)} {kind}; it must have at most {most}")
         try:
             [element.name for element in elements if hasattr(element, "name")]
         except UnicodeDecodeError:

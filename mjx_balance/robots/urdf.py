@@ -46,7 +46,10 @@ def read(path: Path, visual: bool) -> str:
     compiler.attrib.update(strippath="false", meshdir="")
     if visual:
         compiler.set("discardvisual", "false")
-    return ElementTree.tostring(robot, encoding="unicode")
+    try:
+        return ElementTree.tostring(robot, encoding="unicode")
+    except RecursionError:
+        raise RobotError(f"{path.name}: its elements are nested too deep to be read") from None
 
 
 def _mesh_file(name: str, folders: tuple[Path, Path]) -> str:

@@ -147,7 +147,7 @@ def test_what_the_stance_can_bear() -> None:
     edge = min(com[0] - back, front - com[0], com[1] - right, left - com[1])
     speed = edge * np.sqrt(9.81 / com[2])
     line = describe(scene, got)[12]
-    assert f"a push of {speed:.2f} m/s tips it over (suite push: up to 0.40)" in line
+    assert f"it cannot bear pushes above {speed:.2f} m/s (suite push: up to 0.40)" in line
     assert f"{1000 * com[2]:.0f} mm above the board" in line
     assert "mm behind and 0 mm" in line
 

@@ -376,7 +376,9 @@ HUGE = {
         r"repeats elements up to 4e\+06 times",
     ),
     "hidden repetition": ('<replicate sep=">" count="&#57;99999"/>', "repeats elements"),
-    "bodies": ("<body/>" * 10001, r"has 100\d\d bodies; it must have at most"),
+    "bodies": ("<body/>" * 100_000, "has 1000.. times <body; it may have 1000"),
+    "sites": ("<site/>" * 100_000, "has 1000.. times <; it may have 40000"),
+    "repeated bodies": ('<replicate count="1001"><body/></replicate>', "bodies; it must have at"),
     "name": ('<site name="a\udcff"/>', "has a name among its sites that is not UTF-8"),
     "pipe": ('<include file="pipe"/>', "includes '.*pipe', which is no regular file"),
     "megabytes": (f"<!--{'x' * 2**24}-->", "has more than 16 MiB of XML"),
@@ -400,6 +402,29 @@ def test_a_model_that_would_take_the_machine_is_refused(kind: str, tmp_path: Pat
     assert time.process_time() - start < 3
     assert len(str(caught.value)) <= 300
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "<a>" * 5000 + "</a>" * 5000,
+        "<a>&lots;</a>",
+    ],
+    ids=["nested", "entities"],
+)
+def test_xml_that_would_take_the_machine(content: str, tmp_path: Path) -> None:
+    text = urdf([("</robot>", f"{content}</robot>")])
+    with pytest.raises(RobotError, match=r"model.urdf"):
+        drafted(tmp_path, text)
+
+
+def test_nothing_is_written_beside_a_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo warns of NaN in a log file."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "model.xml").write_text(walker().replace('size=".2 .1 .05"', 'size=".2 .1 nan"'))
+    with pytest.raises(RobotError, match=r"model.xml"):
+        draft("model.xml", tmp_path / "model.xml")
+    assert [path.name for path in tmp_path.iterdir()] == ["model.xml"]
 
 
 LARGE = {
