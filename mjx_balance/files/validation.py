@@ -114,7 +114,7 @@ def _sentence(
             name, value = place, child
         elif isinstance(title, str):
             owner, value = f" of {name.removesuffix('s')} {shorten(title)}", child
-        elif any(isinstance(x, str) for x in path[k:]):
+        elif isinstance(child, dict | list) and any(isinstance(x, str) for x in path[k:]):
             owner, value = f" of {name}[{place}]", child
         else:
             subject = "each entry"

@@ -29,7 +29,9 @@ def drafted(spec: mujoco.MjSpec, folder: Path) -> tuple[str, Robot]:
         arm = body.find("body[@name='arm0']")
         assert arm is not None
         body.remove(arm)
-        body.insert(0, arm)  # before the legs
+        body.insert(0, arm)  # before the legs; keyframes have the old order
+        for keys in tree.findall("keyframe"):
+            tree.remove(keys)
     (folder / "model.xml").write_bytes(ElementTree.tostring(tree))
     text = draft("model.xml", folder / "model.xml")
     return text, build(parse_robot_file(text, folder / "drafted.toml"))[1]
