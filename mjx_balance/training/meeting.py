@@ -6,38 +6,65 @@ when the process at its other end does.
 """
 
 import contextlib
+import dataclasses
 import json
 import os
 import queue
+import secrets
 import socket
 import threading
 import time
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from mjx_balance.errors import FAILED, InputError
 from mjx_balance.files.text import MESSAGE, shorten
+from mjx_balance.files.validation import STRICT, parse
 
-PROGRAM = "mjx_balance"  #: what a process of ours says first, within `HELLO_S`
-HELLO_S, LINE_BYTES, THREADS = 5, 2**16, 100
-"""Seconds for a hello; longest line that is read; threads at which more connections wait."""
+HELLO_S, LINE_BYTES, CALLERS = 5, 2**16, 100
+"""Seconds for a hello; its greatest length; callers that may be about to say one: the oldest go."""
 KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 4, "TCP_USER_TIMEOUT": 30_000}
 """A machine that answers nothing counts as gone after 30 s."""
-Meeting = tuple[dict[int, socket.socket], list[Any]]
-"""The connections to other processes by their index, and what all say about themselves."""
 
 
 class ProcessError(InputError):
     """Processes that cannot work together; the message says why."""
 
 
-def host(address: tuple[str, int], count: int, about: Any, patience_s: float) -> Meeting:
+@dataclasses.dataclass(frozen=True)
+class Member:
+    """What all processes get to know of one of them."""
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    machine: str  #: host name
+    cores: tuple[int, ...]  #: ids of the CPU cores that it may use
+    service: str = ""  #: IP:PORT at which process 0 starts JAX's coordination service
+
+
+@dataclasses.dataclass(frozen=True)
+class Hello:
+    """What a process says to process 0."""
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    mjx_balance: str  #: number that process 0 has greeted it with, new for every connection
+    index: int
+    count: int
+    member: Member
+
+
+Meeting = tuple[dict[int, socket.socket], tuple[Member, ...]]
+"""The connections to other processes by their index, and what all say about themselves."""
+
+
+def host(address: tuple[str, int], count: int, own: Member, patience_s: float) -> Meeting:
     """Waits, as process 0 of `count`, for all others; listens at this IP and port alone.
+
+    Drops connections that say no hello. A process that leaves before all have come may come again.
 
     Args:
       address: IP and port.
       count: number of processes.
-      about: JSON value that all get to know of this one.
+      own: this process.
       patience_s: longest time to wait, s.
 
     Raises:
@@ -45,8 +72,9 @@ def host(address: tuple[str, int], count: int, about: Any, patience_s: float) ->
     """
     where, until = f"{address[0]} port {address[1]}", time.monotonic() + patience_s
     connections: dict[int, socket.socket] = {}
-    abouts, refusal = {0: about}, ""
-    hellos: queue.SimpleQueue[tuple[socket.socket, int, int, Any]] = queue.SimpleQueue()
+    members, refusal = {0: own}, ""
+    callers: list[socket.socket] = []  # the oldest first
+    hellos: queue.SimpleQueue[tuple[socket.socket, Hello]] = queue.SimpleQueue()
     try:
         server = listen(address)
     except OSError as error:
@@ -54,30 +82,39 @@ def host(address: tuple[str, int], count: int, about: Any, patience_s: float) ->
         raise ProcessError(f"process 0 cannot listen at {where}: {reason}") from error
     with server:
         server.settimeout(0.1)
-        while len(abouts) < count and not refusal:
+        while len(members) < count and not refusal:
             with contextlib.suppress(OSError):
-                if threading.active_count() < THREADS:
-                    caller = server.accept()[0], hellos
-                    threading.Thread(target=_ask, args=caller, daemon=True).start()
+                caller = server.accept()[0]
+                threading.Thread(target=_ask, args=(caller, hellos), daemon=True).start()
+                callers = [*(x for x in callers if x.fileno() >= 0), caller]
+                if len(callers) > CALLERS:
+                    _shut_down(callers.pop(0))
+            for index in [k for k, x in connections.items() if _has_left(x)]:
+                connections.pop(index).close()
+                del members[index]
             if time.monotonic() > until:
-                missing = ", ".join(str(k) for k in range(count) if k not in abouts)
+                missing = ", ".join(str(k) for k in range(count) if k not in members)
                 refusal = f"process {missing} has not come to {where} in {patience_s:g} s"
-            with contextlib.suppress(queue.Empty):
-                connection, index, others, value = hellos.get_nowait()
-                if others != count or index not in range(1, count) or index in abouts:
+            with contextlib.suppress(queue.Empty, ValueError):
+                caller, hello = hellos.get_nowait()
+                callers.remove(caller)  # ValueError: it is not there, and has been shut down
+                index, others = hello.index, hello.count
+                if others != count or index not in range(1, count) or index in members:
                     refusal = (
                         f"a process came to {where} as number {index} of {others}; process 0 waits "
                         f"for {count}, and has met {sorted(connections)}"
                     )
                     index = -1
-                connections[index], abouts[index] = connection, value
+                connections[index], members[index] = caller, hello.member
+    for caller in callers:
+        _shut_down(caller)
     if refusal:
         _send(connections.values(), {"refusal": refusal})
         for connection in connections.values():
             connection.close()
         raise ProcessError(refusal)
-    everyone = [abouts[k] for k in range(count)]
-    _send(connections.values(), {"everyone": everyone})
+    everyone = tuple(members[k] for k in range(count))
+    _send(connections.values(), {"everyone": [dataclasses.asdict(x) for x in everyone]})
     return connections, everyone
 
 
@@ -87,40 +124,84 @@ def listen(address: tuple[str, int]) -> socket.socket:
     return socket.create_server(address, family=family)
 
 
-def _ask(connection: socket.socket, hellos: Any) -> None:
+def _ask(caller: socket.socket, hellos: "queue.SimpleQueue[tuple[socket.socket, Hello]]") -> None:
     """Asks who has connected: a process of ours goes into `hellos`, a stranger is dropped."""
-    hello = _receive(connection, HELLO_S)
-    numbers = hello.get("index"), hello.get("count")
-    if hello.get("program") == PROGRAM and all(isinstance(x, int) for x in numbers):
-        hellos.put((connection, *numbers, hello.get("about")))
+    nonce = secrets.token_hex()  # so that a hello that somebody has recorded is none
+    _send([caller], {"mjx_balance": nonce})
+    try:
+        hello = parse(Hello, _receive(caller, time.monotonic() + HELLO_S))
+    except InputError:
+        hello = None
+    if hello is not None and hello.mjx_balance == nonce:
+        caller.settimeout(HELLO_S)
+        hellos.put((caller, hello))
     else:
-        connection.close()
+        caller.close()
+
+
+def _shut_down(caller: socket.socket) -> None:
+    """Ends a connection; the thread that reads from it closes it."""
+    with contextlib.suppress(OSError):
+        caller.shutdown(socket.SHUT_RDWR)
+
+
+def _has_left(connection: socket.socket) -> bool:
+    """Whether a process that should be waiting has closed its connection, or talks."""
+    connection.setblocking(False)
+    try:
+        connection.recv(1)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    finally:
+        connection.settimeout(HELLO_S)
+    return True
 
 
 def visit(
-    address: tuple[str, int], index: int, count: int, about: Any, patience_s: float
+    address: tuple[str, int], index: int, count: int, own: Member, patience_s: float
 ) -> Meeting:
     """Comes to process 0, as process `index`, and waits for all others; otherwise as `host`."""
     where, until = f"{address[0]} port {address[1]}", time.monotonic() + patience_s
-    while True:  # process 0 may be started later
+    # Process 0 loses patience at about the same time, and knows who is missing.
+    last, reason, hello = until + 5, "", None
+    while True:  # process 0 may be started later, and drops the slow if many strangers call
         try:
             connection = socket.create_connection(address, timeout=5)
-            break
         except OSError as error:
-            if time.monotonic() > until:
-                raise ProcessError(
-                    f"process 0 does not answer at {where} within {patience_s:g} s "
-                    f"({error.strerror or error}); is it started, and is that its address?"
-                ) from error
-            time.sleep(0.2)
-    _send([connection], {"program": PROGRAM, "index": index, "count": count, "about": about})
-    # Process 0 loses patience at about the same time, and knows who is missing.
-    answer = _receive(connection, until + 5 - time.monotonic())
-    if "everyone" not in answer:
-        connection.close()
-        left = f"process 0 has left the meeting at {where}"
-        raise ProcessError(shorten(answer.get("refusal", left), MESSAGE))
-    return {0: connection}, answer["everyone"]
+            reason = error.strerror or str(error)
+            if hello is not None and isinstance(error, ConnectionRefusedError):
+                raise ProcessError(f"process 0 has left the meeting at {where}") from error
+        else:
+            reason = "what answers is no process 0"
+            with contextlib.ExitStack() as stack:
+                stack.enter_context(connection)
+                nonce = _receive(connection, until).get("mjx_balance")
+                if isinstance(nonce, str):
+                    reason, hello = "it drops the connection", Hello(nonce, index, count, own)
+                    _send([connection], dataclasses.asdict(hello))
+                    answer = _receive(connection, last, count * LINE_BYTES)
+                    if "refusal" in answer:
+                        raise ProcessError(shorten(answer["refusal"], MESSAGE))
+                    if "everyone" in answer:
+                        members = _members(answer["everyone"], count)
+                        stack.pop_all()  # the connection stays open
+                        return {0: connection}, members
+        if time.monotonic() > until:
+            raise ProcessError(
+                f"process 0 does not answer at {where} within {patience_s:g} s ({reason}); is it "
+                "started, and is that its address?"
+            )
+        time.sleep(0.2)
+
+
+def _members(values: Any, count: int) -> tuple[Member, ...]:
+    """What process 0 says about everyone."""
+    members = parse(tuple[Member, ...], values, ProcessError, name="what process 0 says")
+    if len(members) != count:
+        raise ProcessError(f"process 0 says that {len(members)} have come; {count} were awaited")
+    return members
 
 
 def _send(connections: Iterable[socket.socket], message: dict[str, Any]) -> None:
@@ -130,12 +211,19 @@ def _send(connections: Iterable[socket.socket], message: dict[str, Any]) -> None
             connection.sendall(json.dumps(message).encode() + b"\n")
 
 
-def _receive(connection: socket.socket, timeout_s: float | None) -> dict[str, Any]:
-    """The next line, a JSON object; empty if none comes."""
-    message = None
+def _receive(
+    connection: socket.socket, until: float | None, limit: int = LINE_BYTES
+) -> dict[str, Any]:
+    """The next line, a JSON object; empty if none comes until `time.monotonic()` is `until`."""
+    line, message = b"", None
     with contextlib.suppress(OSError, ValueError, RecursionError):
-        connection.settimeout(timeout_s)
-        message = json.loads(connection.makefile("rb").readline(LINE_BYTES))
+        while b"\n" not in line and len(line) < limit:
+            left = None if until is None else until - time.monotonic()
+            if left is not None and left <= 0:
+                return {}
+            connection.settimeout(left)
+            line += connection.recv(LINE_BYTES) or b"\n"
+        message = json.loads(line.partition(b"\n")[0])
     return message if isinstance(message, dict) else {}
 
 
@@ -159,7 +247,7 @@ class Watch:
     def _listen(self, other: int, connection: socket.socket) -> None:
         """Waits until a connection ends, or until process 0 says which other one has."""
         with connection:
-            lost = _receive(connection, None).get("lost", other)
+            lost = shorten(_receive(connection, None).get("lost", other))
             if self._ended.acquire(blocking=False):
                 end = f"process {lost} is gone, and the run ends with it{self.advice}"
                 os.write(2, f"mjx-balance: {end}\n".encode())  # before JAX aborts

@@ -18,7 +18,7 @@ from jax.experimental import multihost_utils
 from mjx_balance.errors import FAILED, INTERRUPTED
 from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.machine import core_ids
-from mjx_balance.training.meeting import ProcessError, Watch, host, listen, visit
+from mjx_balance.training.meeting import Member, ProcessError, Watch, host, listen, visit
 
 T = TypeVar("T")
 
@@ -206,17 +206,17 @@ def _connect(cluster: Cluster) -> Processes:
     """Meets the others, shares the machine with them and connects the devices of all."""
     index, count = cluster.process_id, cluster.num_processes
     address = resolve(cluster.coordinator_address)
-    about: dict[str, Any] = {"machine": socket.gethostname(), "cores": core_ids()}
+    service = "" if index else _free_address(address[0])
+    own = Member(socket.gethostname(), tuple(core_ids()), service)
     if index:
-        connections, everyone = visit(address, index, count, about, PATIENCE_S)
+        connections, everyone = visit(address, index, count, own, PATIENCE_S)
     else:
-        about["service"] = _free_address(address[0])
-        connections, everyone = host(address, count, about, PATIENCE_S)
+        connections, everyone = host(address, count, own, PATIENCE_S)
     watch = Watch(connections)
     num_cores = share_machine(everyone, index)
     os.environ["no_grpc_proxy"] = address[0]  # noqa: SIM112
     jax.config.update("jax_check_proxy_envs", False)
-    service = everyone[0]["service"]
+    service = everyone[0].service
     jax.distributed.initialize(
         service,
         count,
@@ -234,17 +234,17 @@ def _free_address(ip: str) -> str:
         return f"{f'[{ip}]' if ':' in ip else ip}:{server.getsockname()[1]}"
 
 
-def share_machine(everyone: Sequence[Mapping[str, Any]], index: int) -> int:
+def share_machine(everyone: Sequence[Member], index: int) -> int:
     """Binds processes that may use the same cores of one machine to cores of their own each.
 
     Args:
-      everyone: `machine` and `cores` of every process.
+      everyone: what is known of every process.
       index: of this process.
 
     Returns:
       Least number of cores of a process.
     """
-    places = [(own["machine"], own["cores"]) for own in everyone]
+    places = [(own.machine, own.cores) for own in everyone]
     shares = []
     for k, (_, cores) in enumerate(places):
         beside, before = places.count(places[k]), places[:k].count(places[k])

@@ -1,7 +1,9 @@
 """Processes that meet over sockets among strangers, and miss one another: here they are threads."""
 
 import contextlib
+import json
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +12,7 @@ from typing import Any
 import pytest
 
 from mjx_balance.training import meeting
-from mjx_balance.training.meeting import ProcessError, Watch, host, visit
+from mjx_balance.training.meeting import Member, ProcessError, Watch, host, visit
 
 Address = tuple[str, int]
 
@@ -53,15 +55,17 @@ def opened() -> Iterator[list[socket.socket]]:
 
 @pytest.fixture
 def come(address: Address, opened: list[socket.socket]) -> Callable[..., Any]:
-    """Index, count -> what a process gets to know of all."""
+    """Index, count -> the machines of all, as a process gets to know them."""
 
     def come(index: int, count: int, patience_s: float = 20, at: Address = address) -> Any:
+        own = Member(f"machine {index}", tuple(range(128)))
         if index:
-            connections, everyone = visit(at, index, count, f"about {index}", patience_s)
+            connections, everyone = visit(at, index, count, own, patience_s)
         else:
-            connections, everyone = host(at, count, "about 0", patience_s)
+            connections, everyone = host(at, count, own, patience_s)
         opened.extend(connections.values())
-        return everyone
+        assert {x.cores for x in everyone} == {own.cores}
+        return [x.machine for x in everyone]
 
     return come
 
@@ -73,7 +77,17 @@ def message(outcome: Any) -> str:
 
 def test_all_get_to_know_of_all(come: Any) -> None:
     calls = [lambda k=k: come(k, 3) for k in (2, 1, 0)]
-    assert at_once(*calls) == [["about 0", "about 1", "about 2"]] * 3
+    assert at_once(*calls) == [["machine 0", "machine 1", "machine 2"]] * 3
+
+
+def test_what_many_processes_say_may_be_longer_than_a_hello(
+    address: Address, monkeypatch: pytest.MonkeyPatch, come: Any
+) -> None:
+    """Three members of some 500 bytes each."""
+    monkeypatch.setattr(meeting, "LINE_BYTES", 1000)
+    assert at_once(*(lambda k=k: come(k, 3) for k in range(3)))[2] == [
+        *("machine 0", "machine 1", "machine 2")
+    ]
 
 
 def test_nobody_waits_for_ever(address: Address, come: Any) -> None:
@@ -102,7 +116,20 @@ def test_processes_that_count_differently_are_refused(
     )
 
 
-GREETING = b'{"program": "mjx_balance", '
+def hello(**changes: Any) -> bytes:
+    """The line of a process 1 of 2 that has not read its number."""
+    member = {"machine": "m", "cores": [0], "service": ""}
+    fields = {"mjx_balance": "0" * 64, "index": 1, "count": 2, "member": member}
+    return json.dumps(fields | changes).encode() + b"\n"
+
+
+def knock(address: Address, seconds: float = 10) -> socket.socket:
+    """Connects as soon as somebody listens."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        with contextlib.suppress(OSError):
+            return socket.create_connection(address)
+    raise ConnectionRefusedError
 
 
 @pytest.mark.parametrize(
@@ -117,24 +144,23 @@ GREETING = b'{"program": "mjx_balance", '
         [b"[" * 60_000 + b"\n"],
         [b"x" * 2**18],
         [b"["] * 4,
-        [GREETING + b'"index": "1", "count": 2, "about": 0}\n'],
-        [GREETING + b'"index": [1], "count": {}}\n'],
-        [GREETING + b"}\n"],
+        [hello()],
+        [hello(count=3)],
+        [hello(), b'{"lost": "\\u001b[2J"}\n'],
+        [hello(index=[1], count={}, member="x")],
+        [hello(index=True), b"\0" * 1000],
     ],
-    ids="idle http list count text number nested endless slow words lists empty".split(),
+    ids="idle http list count text number nested endless slow recorded miscounts talks types "
+    "bool".split(),
 )
 def test_strangers_neither_end_nor_block_the_meeting(
     lines: list[bytes], address: Address, opened: Any, come: Any
 ) -> None:
     def stranger() -> None:
-        connection = None
-        while connection is None:  # until the first listens
-            with contextlib.suppress(OSError):
-                connection = socket.create_connection(address)
-        opened.append(connection)
+        opened.append(knock(address))
         with contextlib.suppress(OSError):  # it has been dropped
             for line in lines:
-                connection.sendall(line)
+                opened[-1].sendall(line)
                 time.sleep(0.1)
 
     def second() -> Any:
@@ -144,8 +170,124 @@ def test_strangers_neither_end_nor_block_the_meeting(
     began = time.monotonic()
     met, *_ = outcomes = at_once(lambda: come(0, 2), second, *[stranger] * 4)
     assert outcomes == [met, met, *[None] * 4]
-    assert met == ["about 0", "about 1"]
+    assert met == ["machine 0", "machine 1"]
     assert time.monotonic() - began < 15
+
+
+@pytest.mark.parametrize("say", [b"", b"[", None], ids=["idle", "slow", "reset"])
+def test_no_number_of_strangers_keeps_a_process_out(
+    say: bytes | None, address: Address, opened: Any, come: Any
+) -> None:
+    """Three times as many as may wait, and more of them until the end; some say a byte a second."""
+    over = threading.Event()
+
+    def flood() -> None:
+        opened.append(knock(address))
+        with contextlib.suppress(OSError):  # the meeting is over
+            while not over.is_set():
+                opened.append(knock(address, 0.1))
+                if say is None:  # what a port scanner does: away at once, without a goodbye
+                    linger = struct.pack("ii", 1, 0)
+                    opened[-1].setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+                    opened.pop().close()
+                if len(opened) > 3 * meeting.CALLERS:
+                    opened.pop(0).close()
+                    time.sleep(0.01)
+                for one in opened[-10:] if say else []:
+                    with contextlib.suppress(OSError):
+                        one.sendall(say or b"")
+
+    def second() -> Any:
+        time.sleep(1.5)
+        try:
+            return come(1, 2)
+        finally:
+            over.set()
+
+    outcomes = at_once(lambda: come(0, 2), second, flood)
+    assert outcomes == [["machine 0", "machine 1"]] * 2 + [None]
+
+
+def test_a_byte_a_second_is_no_hello(
+    address: Address, monkeypatch: pytest.MonkeyPatch, opened: Any, come: Any
+) -> None:
+    """However many come: the time for a hello is counted from its first byte."""
+    monkeypatch.setattr(meeting, "HELLO_S", 0.5)
+
+    def drip() -> float:
+        opened.append(knock(address))
+        began = time.monotonic()
+        with contextlib.suppress(OSError):
+            while time.monotonic() - began < 5:
+                opened[0].sendall(b"[")
+                time.sleep(0.1)
+        return time.monotonic() - began
+
+    _, seconds = at_once(lambda: come(0, 2, 3), drip)
+    assert seconds < 2
+
+
+def test_a_process_that_was_killed_may_come_again(address: Address, come: Any) -> None:
+    """As long as another one is awaited; nobody waits for the one that is gone."""
+
+    def killed() -> None:
+        connection = knock(address)
+        greeting = json.loads(connection.makefile("rb").readline())
+        connection.sendall(hello(mjx_balance=greeting["mjx_balance"], count=3))
+        time.sleep(0.3)
+        connection.close()
+
+    def late(index: int) -> Any:
+        time.sleep(0.8)
+        return come(index, 3)
+
+    first, _, *others = at_once(lambda: come(0, 3), killed, lambda: late(1), lambda: late(2))
+    assert first == ["machine 0", "machine 1", "machine 2"]
+    assert others == [first, first]
+
+
+def test_whoever_comes_after_the_meeting_is_told(address: Address, come: Any) -> None:
+    """Process 0 has gone while process 1 waits for process 2."""
+
+    def first() -> None:
+        with socket.create_server(address) as server:
+            connection, _ = server.accept()
+            connection.sendall(b'{"mjx_balance": "1"}\n')
+            connection.recv(1000)
+        connection.close()
+
+    _, outcome = at_once(first, lambda: come(1, 3))
+    assert message(outcome) == f"process 0 has left the meeting at 127.0.0.1 port {address[1]}"
+
+
+@pytest.mark.parametrize("banner", [b"", b"SSH-2.0-x\r\n", b'{"mjx_balance": 5}\n', b"[" * 10**5])
+def test_another_service_at_the_address_is_not_joined(
+    banner: bytes, address: Address, opened: Any, come: Any
+) -> None:
+    def service() -> None:
+        with socket.create_server(address) as server:
+            server.settimeout(2)
+            with contextlib.suppress(OSError):
+                while True:
+                    opened.append(server.accept()[0])
+                    opened[-1].sendall(banner)
+
+    [outcome, _] = at_once(lambda: come(1, 2, 1), service)
+    assert "within 1 s (what answers is no process 0); is it started" in message(outcome)
+
+
+@pytest.mark.parametrize("everyone", [5, [], [{"machine": "m"}], [{"machine": 1, "cores": []}] * 2])
+def test_what_process_0_says_is_checked(everyone: Any, address: Address, come: Any) -> None:
+    def first() -> None:
+        with socket.create_server(address) as server:
+            connection, _ = server.accept()
+            connection.sendall(b'{"mjx_balance": "1"}\n')
+            connection.recv(10_000)
+            connection.sendall(json.dumps({"everyone": everyone}).encode() + b"\n")
+            connection.close()
+
+    _, outcome = at_once(first, lambda: come(1, 2))
+    assert len(message(outcome)) < 300
 
 
 def test_only_the_coordinators_address_is_listened_at(address: Address, come: Any) -> None:
@@ -203,6 +345,20 @@ def test_a_lost_process_ends_all_with_a_sentence(
     assert exits == [1, 1]
     sentence = "mjx-balance: process 1 is gone, and the run ends with it; continue with --resume x"
     assert capfd.readouterr().err.splitlines() == [sentence] * 2
+
+
+@pytest.mark.parametrize("lost", ["\x1b[2J", "\ud800", [[1]] * 500, 10**400, None])
+def test_what_a_peer_says_reaches_the_terminal_short_and_safe(
+    lost: Any, pairs: Any, exits: list[int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    (to_1, at_1), _ = pairs
+    Watch({1: to_1})
+    at_1.sendall(json.dumps({"lost": lost}).encode() + b"\n")
+    wait_for(lambda: exits)
+    assert exits == [1]
+    line = capfd.readouterr().err.removesuffix("\n")
+    assert line.isprintable()
+    assert len(line) < 200
 
 
 def test_a_silent_machine_counts_as_gone_after_half_a_minute() -> None:

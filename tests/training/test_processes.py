@@ -14,7 +14,7 @@ from mjx_balance.config import ConfigError
 from mjx_balance.evaluation.rollout import EvaluationError
 from mjx_balance.machine import core_ids, cores
 from mjx_balance.training import processes
-from mjx_balance.training.meeting import ProcessError
+from mjx_balance.training.meeting import Member, ProcessError
 from mjx_balance.training.processes import ALONE, Processes, find_cluster, resolve, share_machine
 
 CLUSTERS = "SLURM OMPI KUBERNETES JAX_COORDINATOR".split()
@@ -139,16 +139,15 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatc
 
     def share(*everyone: tuple[str, list[int]]) -> tuple[list[Sequence[int]], set[int]]:
         bound.clear()
-        known = [{"machine": machine, "cores": cores} for machine, cores in everyone]
-        known[0]["service"] = "process 0 says more"
+        known = [Member(machine, tuple(cores)) for machine, cores in everyone]
         return bound, {share_machine(known, k) for k in range(len(known))}
 
     shared, fewest = share(*[("a", [2, 3, 4, 5, 6])] * 3)
     assert sorted(core for cores in shared for core in cores) == [2, 3, 4, 5, 6]
     assert fewest == {1}
-    assert share(("a", [0, 1]), ("a", [2, 3, 4])) == ([[0, 1], [2, 3, 4]], {2})
-    assert share(("a", [0, 1]), ("b", [0, 1])) == ([[0, 1], [0, 1]], {2})
-    assert share(*[("a", [4, 5])] * 3) == ([[4, 5]] * 3, {2}), "too few to share"
+    assert share(("a", [0, 1]), ("a", [2, 3, 4])) == ([(0, 1), (2, 3, 4)], {2})
+    assert share(("a", [0, 1]), ("b", [0, 1])) == ([(0, 1), (0, 1)], {2})
+    assert share(*[("a", [4, 5])] * 3) == ([(4, 5)] * 3, {2}), "too few to share"
 
 
 def test_cores_are_those_that_a_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
