@@ -1,6 +1,7 @@
 """The command line, `mjx-balance`: one module per command, imported when it runs."""
 
 import importlib
+import io
 import sys
 from collections.abc import Sequence
 
@@ -22,6 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns 0, 1 for failures, 2 for invalid input, 130 after Ctrl-C."""
     from mjx_balance.cli.common import HELP, complain
 
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may know ASCII alone
+        sys.stdout.reconfigure(errors="backslashreplace")
     name, *argv = list(sys.argv[1:] if arguments is None else arguments) or [""]
     if name not in COMMANDS:
         print(f"usage: mjx-balance {{{','.join(COMMANDS)}}} ... (--help after one lists its flags)")

@@ -72,7 +72,7 @@ class Display:
         """Shows a phase of unknown length, then the time it took."""
         began = time.perf_counter()
         if self.console.is_terminal:
-            with self.console.status(escape(name)):
+            with self.console.status(escape(name), spinner=self._spinner):
                 yield
         else:
             self.say(f"{name} ...")
@@ -86,7 +86,8 @@ class Display:
             self.say(f"{name} ...")
             yield lambda share: None
             return
-        columns = (bars.SpinnerColumn(), escape(name), bars.BarColumn(), bars.TimeRemainingColumn())
+        spinner = bars.SpinnerColumn(self._spinner)
+        columns = (spinner, escape(name), bars.BarColumn(), bars.TimeRemainingColumn())
         with bars.Progress(*columns, console=self.console, transient=True) as progress:
             task = progress.add_task(name, total=1.0)
             yield lambda share: progress.update(task, completed=share)
@@ -102,7 +103,7 @@ class Display:
         self._total, self._done_at_start = total, done
         self._start = self._last = time.perf_counter()
         self._progress = bars.Progress(
-            bars.SpinnerColumn(),
+            bars.SpinnerColumn(self._spinner),
             "training",
             bars.BarColumn(bar_width=None),
             bars.MofNCompleteColumn(),
