@@ -101,16 +101,17 @@ class BalanceEnv(Env):
             "truncation": jnp.float32(0.0),
         }
         if ranges.varies:
-            params = draw_params(ranges, robot, jax.random.uniform(key_params, (DRAWS,)))
+            draws = jax.random.uniform(key_params, (DRAWS,), jnp.float32)
+            params = draw_params(ranges, robot, draws)
             info["noise_key"] = key_noise
         due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
         if len(due):
-            draws = jax.random.uniform(key_pushes, (len(due), 2))
+            draws = jax.random.uniform(key_pushes, (len(due), 2), jnp.float32)
             pushes = Pushes(draw_velocity(ranges, draws), jnp.asarray(due, jnp.int32))
         keys = iter(jax.random.split(rng, 4))
 
         def uniform(shape: tuple[int, ...], low: float, high: float) -> jax.Array:
-            return jax.random.uniform(next(keys), shape, minval=low, maxval=high)
+            return jax.random.uniform(next(keys), shape, jnp.float32, low, high)
 
         start = EnvState(
             physics=self.engine.initial(),
@@ -131,7 +132,8 @@ class BalanceEnv(Env):
         """`reset` with a random time limit, so that first episodes do not time out together."""
         key_reset, key_length = jax.random.split(rng)
         state = self.reset(key_reset)
-        length = jax.random.randint(key_length, (), 1, self.config.task.episode_length + 1)
+        most = self.config.task.episode_length
+        length = jax.random.randint(key_length, (), 1, most + 1, jnp.int32)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             info=state.info | {"episode_length": length}
         )
@@ -144,13 +146,13 @@ class BalanceEnv(Env):
         task, info, noise = self.config.task, state.info, None
         if "noise_key" in info:
             key, key_noise = jax.random.split(info["noise_key"])
-            noise = jax.random.normal(key_noise, (task.sim_steps, 6))
+            noise = jax.random.normal(key_noise, (task.sim_steps, 6), jnp.float32)
             info = info | {"noise_key": key}
         before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         if self._discrete:
-            change = jnp.asarray(self._table)[action]
+            change = jnp.asarray(self._table, jnp.float32)[action]
         else:
-            change = task.action_max * jnp.clip(action, -1.0, 1.0)
+            change = task.action_max * jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
         after, outcome = step(task, self.scene.robot, self.engine, before, change, noise)
         truncated = ~outcome.terminated & (after.env_steps >= info["episode_length"])
         metrics = {

@@ -72,8 +72,10 @@ class _NewScenarios(AutoResetWrapper):
         """Starts episodes from keys (n, 2)."""
         rng, following = jnp.moveaxis(jax.vmap(jax.random.split)(rng), 1, 0)
         state = super().reset(rng)
-        state.info["next_key"] = following
-        return state
+        # brax makes its own of JAX's default type, which may have 64 bits.
+        info = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, state.info)
+        info["next_key"] = following
+        return state.replace(info=info)  # pyright: ignore[reportAttributeAccessIssue]
 
     def step(self, state: State, action: jax.Array) -> State:
         """Takes one decision of every env; `obs` of one that is over is the next episode's."""

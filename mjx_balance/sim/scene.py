@@ -162,13 +162,13 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
         robot_source=config.robot,
         model=model,
         trunk=trunk.id,
-        leg_qpos=np.asarray([[model.joint(n).qposadr[0] for n in leg] for leg in names]),
-        leg_ctrl=np.asarray([[model.actuator(n).id for n in leg] for leg in names]),
-        board_qpos=np.asarray([model.joint(n).qposadr[0] for n in board]),
-        board_ctrl=np.asarray([model.actuator(n).id for n in board]),
-        trunk_quat=root.qposadr[0] + np.arange(3, 7),
-        trunk_velocity=root.dofadr[0] + np.arange(2),
-        imu=np.concatenate([s.adr[0] + np.arange(s.dim[0]) for s in sensors]),
+        leg_qpos=np.int32([[model.joint(n).qposadr[0] for n in leg] for leg in names]),
+        leg_ctrl=np.int32([[model.actuator(n).id for n in leg] for leg in names]),
+        board_qpos=np.int32([model.joint(n).qposadr[0] for n in board]),
+        board_ctrl=np.int32([model.actuator(n).id for n in board]),
+        trunk_quat=np.int32(root.qposadr[0] + np.arange(3, 7)),
+        trunk_velocity=np.int32(root.dofadr[0] + np.arange(2)),
+        imu=np.int32([k for s in sensors for k in range(s.adr[0], s.adr[0] + s.dim[0])]),
     )
     return Scene(**vars(layout), stance=_settle(layout))
 

@@ -121,7 +121,8 @@ class Interrupts:
 
         def work() -> None:
             try:
-                future.set_result(call(*arguments))
+                with jax.enable_x64(False):  # as in `run.train`; it counts per thread
+                    future.set_result(call(*arguments))
             except BaseException as error:
                 future.set_exception(error)
 

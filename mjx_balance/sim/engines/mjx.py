@@ -55,10 +55,11 @@ def mjx_engine(scene: Scene, options: Options) -> JaxEngine:
     def physics(
         state: PhysicsState, ctrl: jax.Array, params: DomainParams | None
     ) -> tuple[PhysicsState, Motion]:
-        fields = {} if params is None else randomized_fields(scene, params)
-        model, blank = on_device()
-        own = model.replace(**fields)
-        step = lambda state, ctrl: physics_step(scene, own, blank, state, ctrl)[:2]  # noqa: E731
-        return jax.lax.scan(step, state, ctrl)
+        with jax.enable_x64(False):  # MJX computes in JAX's default precision
+            fields = {} if params is None else randomized_fields(scene, params)
+            model, blank = on_device()
+            own = model.replace(**fields)
+            step = lambda state, ctrl: physics_step(scene, own, blank, state, ctrl)[:2]  # noqa: E731
+            return jax.lax.scan(step, state, ctrl)
 
     return JaxEngine(scene, physics)
