@@ -5,10 +5,15 @@ installed, this import registers `mjx_balance/Balance-v0`.
 """
 
 import contextlib
+import os
 from typing import TYPE_CHECKING
 
+from mjx_balance.quiet import import_mujoco, quiet_imports
+
+if os.environ.get("MUJOCO_GL"):
+    import_mujoco()
+
 from mjx_balance.policy.file import load_policy
-from mjx_balance.quiet import quiet_imports
 
 if TYPE_CHECKING:
     from mjx_balance.envs.balance import BalanceEnv

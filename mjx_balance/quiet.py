@@ -1,4 +1,4 @@
-"""Silences the imports of JAX and MJX, and skips optional packages that they import."""
+"""Imports of libraries: silent, without optional packages, whatever MUJOCO_GL says."""
 
 import contextlib
 import io

@@ -9,6 +9,7 @@ from rich.console import Console
 from mjx_balance.cli.common import HELP, complain
 from mjx_balance.config import Config, preset, read_run_config
 from mjx_balance.errors import FAILED, INTERRUPTED, how_to_install
+from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.policy.file import PolicyError
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.robots.limits import for_robot
@@ -82,6 +83,8 @@ def train(argv: list[str]) -> int:
         return complain(
             f"training needs {package}, which is not installed; {how_to_install('train')}"
         )
+    except ValueError as error:  # JAX's own, for what it reads from variables
+        return complain(f"JAX cannot be imported: {shorten(error, MESSAGE)}")
     return _train(args)
 
 

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import psutil
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.errors import InputError
 from mjx_balance.evaluation.controllers import Controller, View
 from mjx_balance.evaluation.suites import draw_suite
+from mjx_balance.machine import available_memory
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.robots.catalogue import RobotError, find_robot
 from mjx_balance.sim.scene import Scene, load_scene
@@ -234,7 +234,7 @@ def check_fits(task: TaskConfig, scenarios: int, duration: float, recorded: int 
         raise EvaluationError(f"duration is {duration}; it must be a number of seconds above 0")
     steps = scenarios * duration / task.sim_dt
     needed = 8 * steps * (TILT_COPIES + recorded)
-    available = psutil.virtual_memory().available
+    available = available_memory()
     if needed > available:
         raise EvaluationError(
             f"scenarios is {scenarios} and duration {duration:g} s: that takes about "

@@ -38,6 +38,7 @@ class Member:
     __pydantic_config__: ClassVar[Any] = STRICT
     machine: str  #: host name
     cores: tuple[int, ...]  #: ids of the CPU cores that it may use
+    num_cores: int  #: how many at a time; fewer in a container with a quota
     service: str = ""  #: IP:PORT at which process 0 starts JAX's coordination service
 
 

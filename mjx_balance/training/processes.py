@@ -17,7 +17,7 @@ from jax.experimental import multihost_utils
 
 from mjx_balance.errors import FAILED, INTERRUPTED
 from mjx_balance.files.text import MESSAGE, shorten
-from mjx_balance.machine import core_ids
+from mjx_balance.machine import core_ids, cores
 from mjx_balance.training.meeting import Member, ProcessError, Watch, host, listen, visit
 
 T = TypeVar("T")
@@ -207,7 +207,7 @@ def _connect(cluster: Cluster) -> Processes:
     index, count = cluster.process_id, cluster.num_processes
     address = resolve(cluster.coordinator_address)
     service = "" if index else _free_address(address[0])
-    own = Member(socket.gethostname(), tuple(core_ids()), service)
+    own = Member(socket.gethostname(), tuple(core_ids()), cores(), service)
     if index:
         connections, everyone = visit(address, index, count, own, PATIENCE_S)
     else:
@@ -246,9 +246,9 @@ def share_machine(everyone: Sequence[Member], index: int) -> int:
     """
     places = [(own.machine, own.cores) for own in everyone]
     shares = []
-    for k, (_, cores) in enumerate(places):
+    for k, (_, ids) in enumerate(places):
         beside, before = places.count(places[k]), places[:k].count(places[k])
-        shares.append(cores[before::beside] if beside <= len(cores) else cores)
+        shares.append(ids[before::beside] if beside <= len(ids) else ids)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, shares[index])
     # A message wakes gloo's thread, which spins if another thread has its connection; on one core
@@ -257,4 +257,5 @@ def share_machine(everyone: Sequence[Member], index: int) -> int:
     if hasattr(os, "SCHED_BATCH"):
         with contextlib.suppress(OSError):  # not everybody may
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    return min(len(share) for share in shares)
+    most = (min(len(share), own.num_cores) for share, own in zip(shares, everyone, strict=True))
+    return min(most)

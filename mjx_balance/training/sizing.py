@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import psutil
 from jax.sharding import PartitionSpec
 
 from mjx_balance.config import Config, ConfigError, check, expand_runs, preset, sweep_grid
@@ -16,7 +15,8 @@ from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 from mjx_balance.dqn.mesh import REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import write_json
-from mjx_balance.machine import cores
+from mjx_balance.files.text import quote, shorten
+from mjx_balance.machine import available_memory, cores
 from mjx_balance.policy.manifest import network_factors
 from mjx_balance.sim.engines.table import check_platform
 from mjx_balance.training.program_cache import LogFn, cache_dir, enable_compilation_cache
@@ -40,13 +40,20 @@ def configure_jax(log_fn: LogFn, num_cores: int | None = None) -> None:
     """Makes CPU cores (None: all of this process) JAX devices; turns the compilation cache on.
 
     Raises:
-      ConfigError: if not all processes have the same number of devices.
+      ConfigError: if JAX has no device, or not all processes have the same number of devices.
     """
     # Too late if JAX is already in use, as in a notebook: its devices do as they are.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", num_cores or cores())
     enable_compilation_cache(log_fn)
-    counts = [len(jax.local_devices(process_index=k)) for k in range(jax.process_count())]
+    try:
+        counts = [len(jax.local_devices(process_index=k)) for k in range(jax.process_count())]
+    except (RuntimeError, AssertionError) as error:  # the second for "cuda" without its plugin
+        reason = f" ({shorten(error, 100)})" if str(error) else ""
+        raise ConfigError(
+            f"JAX_PLATFORMS is {quote(jax.config.jax_platforms)}, and JAX finds no such device"
+            f"{reason}; set JAX_PLATFORMS=cpu, or unset it"
+        ) from error
     if len(set(counts)) > 1:
         raise ConfigError(
             f"the processes have {counts} JAX devices; all must have the same number, as "
@@ -176,7 +183,7 @@ def check_memory(learner: DQN) -> None:
     if device.platform == "cpu":
         mine = [x for x in spec.devices if x.process_index == jax.process_index()]
         where, needed = "this machine", len(mine) * needed
-        available = psutil.virtual_memory().available
+        available = available_memory()
     else:
         where, stats = "each device", device.memory_stats() or {}
         available = stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)

@@ -58,7 +58,7 @@ def come(address: Address, opened: list[socket.socket]) -> Callable[..., Any]:
     """Index, count -> the machines of all, as a process gets to know them."""
 
     def come(index: int, count: int, patience_s: float = 20, at: Address = address) -> Any:
-        own = Member(f"machine {index}", tuple(range(128)))
+        own = Member(f"machine {index}", tuple(range(128)), 128)
         if index:
             connections, everyone = visit(at, index, count, own, patience_s)
         else:
@@ -118,7 +118,7 @@ def test_processes_that_count_differently_are_refused(
 
 def hello(**changes: Any) -> bytes:
     """The line of a process 1 of 2 that has not read its number."""
-    member = {"machine": "m", "cores": [0], "service": ""}
+    member = {"machine": "m", "cores": [0], "num_cores": 1, "service": ""}
     fields = {"mjx_balance": "0" * 64, "index": 1, "count": 2, "member": member}
     return json.dumps(fields | changes).encode() + b"\n"
 
@@ -276,7 +276,9 @@ def test_another_service_at_the_address_is_not_joined(
     assert "within 1 s (what answers is no process 0); is it started" in message(outcome)
 
 
-@pytest.mark.parametrize("everyone", [5, [], [{"machine": "m"}], [{"machine": 1, "cores": []}] * 2])
+@pytest.mark.parametrize(
+    "everyone", [5, [], [{"machine": "m"}], [{"machine": 1, "cores": [], "num_cores": 1}] * 2]
+)
 def test_what_process_0_says_is_checked(everyone: Any, address: Address, come: Any) -> None:
     def first() -> None:
         with socket.create_server(address) as server:

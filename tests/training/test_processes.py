@@ -137,9 +137,11 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append(cores))
     monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)
 
-    def share(*everyone: tuple[str, list[int]]) -> tuple[list[Sequence[int]], set[int]]:
+    def share(
+        *everyone: tuple[str, list[int]], quota: int = 99
+    ) -> tuple[list[Sequence[int]], set[int]]:
         bound.clear()
-        known = [Member(machine, tuple(cores)) for machine, cores in everyone]
+        known = [Member(machine, tuple(cores), quota) for machine, cores in everyone]
         return bound, {share_machine(known, k) for k in range(len(known))}
 
     shared, fewest = share(*[("a", [2, 3, 4, 5, 6])] * 3)
@@ -148,6 +150,7 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatc
     assert share(("a", [0, 1]), ("a", [2, 3, 4])) == ([(0, 1), (2, 3, 4)], {2})
     assert share(("a", [0, 1]), ("b", [0, 1])) == ([(0, 1), (0, 1)], {2})
     assert share(*[("a", [4, 5])] * 3) == ([(4, 5)] * 3, {2}), "too few to share"
+    assert share(("a", [0, 1, 2, 3]), ("b", [0, 1]), quota=1)[1] == {1}
 
 
 def test_cores_are_those_that_a_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
