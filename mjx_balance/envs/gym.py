@@ -1,11 +1,13 @@
 """Gymnasium's envs in plain MuJoCo, one or many at once; `import mjx_balance` registers them."""
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import InvalidAction, ResetNeeded, UnsupportedMode
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -20,7 +22,7 @@ from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.observation import input_rows
-from mjx_balance.task.step import DIVERGED, Outcome
+from mjx_balance.task.step import DIVERGED
 
 NO_EPISODE = "no episode is under way; call reset() before step()"
 
@@ -38,12 +40,6 @@ def _config(preset: str | None, config: Config | None, robot: str | None) -> Con
     return named if robot is None else for_robot(named, robot)
 
 
-def _check_options(options: dict[str, Any] | None) -> None:
-    """Refuses options, as Gymnasium's `reset_mask`: a reset starts every env anew."""
-    if options:
-        raise ValueError(f"options is {quote(options)}; it must be None or {{}}: there are none")
-
-
 class _Balance:
     """What one env and many have in common: scene, actions, episodes and pictures."""
 
@@ -51,6 +47,8 @@ class _Balance:
     threads: int | None = None  #: worker threads; None: all cores
     # Of the class: an env whose constructor failed is closed, too.
     _painter: Painter | None = None
+    _window: Window | None = None
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -87,6 +85,7 @@ class _Balance:
         self.batch: BatchEnv | None = None
         self.render_mode = render_mode
         task = self.config.task
+        self.max_episode_steps = task.episode_length
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
         self._table = action_table(task) if check_action(action) == "discrete" else None
         shares = spaces.Box(-1, 1, (2,), np.float32)
@@ -96,6 +95,21 @@ class _Balance:
         scale = [row.scale for row in input_rows(task, self.scene.robot)]
         most = DIVERGED / np.asarray(scale, np.float32)
         self.observation_space = self.single_observation_space = spaces.Box(-most, most)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and other processes draw for themselves."""
+        return vars(self) | {"_painter": None, "_window": None}
+
+    @property
+    def spec(self) -> EnvSpec | None:  # pyright: ignore
+        """What Gymnasium has made the env of, with the time limit of its config."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = copy.copy(spec)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.max_episode_steps
 
     def _start(self, rngs: Sequence[np.random.Generator], ids: np.ndarray) -> np.ndarray:
         """Starts an episode from each generator in envs `ids`; returns their first observations."""
@@ -153,7 +167,6 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # noqa: RUF012
     threads = 1
-    _window: Window | None = None
     _running = False
 
     def reset(
@@ -164,7 +177,8 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
         Raises:
           ValueError: if there are options; none exist.
         """
-        _check_options(options)
+        if options:
+            raise ValueError(f"options is {quote(options)}; it must be None or {{}}")
         super().reset(seed=seed)
         obs = self._start([self.np_random], np.arange(1))
         self._running = True
@@ -184,7 +198,8 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
         outcome = self.batch.step(self._height_changes(action, self.action_space)[None])
         self._show(self.batch.path)
         terminated = bool(outcome.terminated[0])
-        truncated = bool(_truncated(self.batch, outcome)[0])
+        over = self.batch.state.env_steps[0] >= self.max_episode_steps
+        truncated = bool(over and not terminated)
         self._running = not (terminated or truncated)
         info = {"tilt_deg": float(outcome.tilt[0].mean()), "fall": terminated}
         obs = outcome.obs[0].astype(np.float32)
@@ -217,8 +232,9 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
 class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many envs in `mujoco.batch.Batch`, on all cores; env k does what one alone would do.
 
-    An env that terminates or is truncated is reset in the same step: its observation is the first
-    of the new episode, `final_obs` and `final_info` are of the old one.
+    An env that terminates or is truncated starts anew as Gymnasium's `autoreset_mode` says. In mode
+    SAME_STEP its observation is the first of the new episode; `final_obs` and `final_info` are of
+    the old one.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -235,16 +251,47 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         action: str = "discrete",
         render_mode: str | None = None,
         robot: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
     ):
-        """Builds the scene of `num_envs` envs; the other arguments are those of `BalanceGymEnv`."""
+        """Builds the scene of `num_envs` envs; the other arguments are those of `BalanceGymEnv`.
+
+        Args:
+          num_envs: number of envs.
+          preset: as for one env, like config, action, render_mode and robot.
+          config: see preset.
+          action: see preset.
+          render_mode: "rgb_array" or None.
+          robot: see preset.
+          autoreset_mode: SAME_STEP; NEXT_STEP, which some of Gymnasium's vector wrappers need; or
+            DISABLED, with `reset(options={"reset_mask": ...})`.
+          max_episode_steps: time limit, decisions; the config's if None.
+        """
         whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
         if not whole or num_envs < 1:
             raise ConfigError(f"num_envs is {quote(num_envs)}; it must be a whole number above 0")
+        try:
+            mode = AutoresetMode(autoreset_mode)
+        except ValueError as error:
+            known = ", ".join(repr(x.value) for x in AutoresetMode)
+            raise ConfigError(
+                f"autoreset_mode is {quote(autoreset_mode)}; it must be one of {known}"
+            ) from error
         super().__init__(preset, config, action, render_mode, robot)
+        longest = self.max_episode_steps
+        if max_episode_steps is not None and not 0 < max_episode_steps <= longest:
+            raise ConfigError(
+                f"max_episode_steps is {quote(max_episode_steps)}; it must be from 1 to {longest}, "
+                "the config's episode_length"
+            )
+        self.max_episode_steps = max_episode_steps or longest
+        self.metadata["autoreset_mode"] = self._mode = mode
         self.num_envs = num_envs
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._rngs: list[np.random.Generator] = []
+        self._over = np.zeros(num_envs, bool)  # episodes that have ended, and nothing began since
+        self._obs = np.zeros(self.observation_space.shape or (), np.float32)
 
     def reset(
         self,
@@ -252,47 +299,86 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seed: int | Sequence[int | None] | np.ndarray | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts fresh scenarios in all envs.
+        """Starts fresh scenarios in all envs, or in those of a mask.
 
         Env k gets seed `seed + k`, or `seed[k]`; one that gets none goes on with its generator.
 
+        Args:
+          seed: of the scenarios.
+          options: in mode DISABLED, `reset_mask` (num_envs,), bool: which envs; None: all.
+
         Raises:
-          ValueError: if there are options (none exist; `reset_mask` is for envs that do not reset
-            by themselves), or not as many seeds as envs.
+          ValueError: for other options, or not as many seeds as envs.
+          ResetNeeded: for a mask before the first reset.
         """
-        _check_options(options)
+        ids = np.flatnonzero(self._reset_mask(options))
+        if len(ids) < self.num_envs and self.batch is None:
+            raise ResetNeeded("reset_mask is given before the first reset of all envs")
         seeds = _seeds(seed, self.num_envs)
         old = self._rngs or [None] * self.num_envs
         self._rngs = [
-            np_random(number)[0] if rng is None or number is not None else rng
-            for number, rng in zip(seeds, old, strict=True)
+            np_random(number)[0] if rng is None or (number is not None and k in ids) else rng
+            for k, (number, rng) in enumerate(zip(seeds, old, strict=True))
         ]
-        return self._start(self._rngs, np.arange(self.num_envs)), {}
+        self._restart(ids)
+        return self._obs.copy(), {}
+
+    def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray:
+        """(n,) which envs a reset starts anew."""
+        if not options:
+            return np.ones(self.num_envs, bool)
+        mask = np.asarray(options.get("reset_mask"))
+        fits = mask.dtype == bool and mask.shape == (self.num_envs,) and mask.any()
+        if self._mode is not AutoresetMode.DISABLED or not fits or len(options) > 1:
+            raise ValueError(
+                f"options is {quote(options)}; it must be None or {{}}, or with autoreset_mode "
+                f"'Disabled' {{'reset_mask': bool array ({self.num_envs},), any of it true}}"
+            )
+        return mask
+
+    def _restart(self, ids: np.ndarray) -> None:
+        """Starts an episode in envs `ids`."""
+        self._obs[ids] = self._start([self._rngs[k] for k in ids], ids)
+        self._over[ids] = False
 
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Takes one decision in every env.
+        """Takes one decision in every env, but where mode NEXT_STEP starts an episode instead.
 
         Raises:
           InvalidAction: for what is not in the action space.
-          ResetNeeded: before the first reset.
+          ResetNeeded: before the first reset, and in mode DISABLED after the end of an episode.
         """
-        if self.batch is None:
+        change = self._height_changes(actions, self.action_space)
+        if self.batch is None or (self._mode is AutoresetMode.DISABLED and self._over.any()):
             raise ResetNeeded(NO_EPISODE)
-        outcome = self.batch.step(self._height_changes(actions, self.action_space))
-        terminated, truncated = outcome.terminated, _truncated(self.batch, outcome)
-        done = terminated | truncated
-        obs, info = outcome.obs.astype(np.float32), _info(outcome, ~done)
+        over, ids = np.flatnonzero(self._over), np.flatnonzero(~self._over)
+        whole = not len(over)
+        reward, tilt = np.zeros(self.num_envs), np.zeros(self.num_envs)
+        terminated, truncated = np.zeros((2, self.num_envs), bool)
+        if len(ids):
+            outcome = self.batch.step(change[ids], None if whole else ids)
+            self._obs[ids], reward[ids] = outcome.obs, outcome.reward
+            tilt[ids], terminated[ids] = outcome.tilt.mean(axis=-1), outcome.terminated
+            late = self.batch.state.env_steps[ids] >= self.max_episode_steps
+            truncated[ids] = ~outcome.terminated & late
+        if len(over):
+            self._restart(over)
+        self._over = done = terminated | truncated
+        moved = np.isin(np.arange(self.num_envs), ids)
+        if self._mode is not AutoresetMode.SAME_STEP:
+            return self._obs.copy(), reward, terminated, truncated, _info(tilt, terminated, moved)
+        info = _info(tilt, terminated, ~done)
         if done.any():
             ids = np.flatnonzero(done)
             final = np.full(self.num_envs, None, object)
             for k in ids:
-                final[k] = obs[k].copy()
-            info |= {"final_obs": final, "_final_obs": done}
-            info |= {"final_info": _info(outcome, done), "_final_info": done.copy()}
-            obs[ids] = self._start([self._rngs[k] for k in ids], ids)
-        return obs, outcome.reward, terminated, truncated, info
+                final[k] = self._obs[k].copy()
+            info |= {"final_obs": final, "_final_obs": done.copy()}
+            info |= {"final_info": _info(tilt, terminated, done), "_final_info": done.copy()}
+            self._restart(ids)
+        return self._obs.copy(), reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture (height, width, 3) of each env."""
@@ -323,12 +409,7 @@ def _seeds(seed: Any, count: int) -> list[int | None]:
     return [int(x) if isinstance(x, np.integer) else x for x in seeds]
 
 
-def _truncated(batch: BatchEnv, outcome: Outcome) -> np.ndarray:
-    """(n,) whether the time limit of a standing robot is reached."""
-    return ~outcome.terminated & (batch.state.env_steps >= batch.task.episode_length)
-
-
-def _info(outcome: Outcome, where: np.ndarray) -> dict[str, np.ndarray]:
+def _info(tilt: np.ndarray, fall: np.ndarray, where: np.ndarray) -> dict[str, np.ndarray]:
     """Tilt and fall of some envs, in Gymnasium's form: 0 elsewhere, and which they are."""
-    tilt, fall = np.where(where, outcome.tilt.mean(axis=-1), 0.0), outcome.terminated & where
-    return {"tilt_deg": tilt, "_tilt_deg": where.copy(), "fall": fall, "_fall": where.copy()}
+    values = {"tilt_deg": np.where(where, tilt, 0.0), "fall": fall & where}
+    return values | {"_tilt_deg": where.copy(), "_fall": where.copy()}

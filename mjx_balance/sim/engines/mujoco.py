@@ -1,5 +1,7 @@
 """MuJoCo's C engine as it ships: many envs, on all cores, in float64. No JAX."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from mujoco.batch import Batch
@@ -21,9 +23,23 @@ class MujocoEngine:
         """Puts `count` robots into the settled stance; `threads` None: all cores."""
         self.scene = scene
         self.recorded: dict[str, np.ndarray] = {}  #: (n, sim_steps, ...) of the last decision
-        self._batch = Batch(scene.model, count, threads or cores())
+        self._size = count, threads or cores()
+        self._batch = Batch(scene.model, *self._size)
         self._params = np.full((count, 6), np.nan)
         self.reset(np.arange(count))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or another process needs to go on: `Batch` itself cannot be pickled."""
+        batch = *map(np.copy, self.state()), self._batch.warning.copy()
+        # Models are randomised again by the next decision.
+        return vars(self) | {"_batch": batch, "_params": np.full_like(self._params, np.nan)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        *physics, warning = state["_batch"]
+        vars(self).update(state)
+        self._batch = Batch(self.scene.model, *self._size)
+        self.set_state(*physics)
+        self._batch.warning[...] = warning
 
     def reset(self, ids: Ids) -> None:
         """Puts envs back into the settled stance."""
