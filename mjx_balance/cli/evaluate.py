@@ -12,7 +12,7 @@ from mjx_balance.evaluation.controllers import Controller
 from mjx_balance.evaluation.rollout import run_suite, summarize
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.report.progress import Display
-from mjx_balance.report.tables import evaluation_table
+from mjx_balance.report.tables import evaluation_table, print_table
 from mjx_balance.sim.scene import Scene
 
 
@@ -44,7 +44,7 @@ def evaluate(argv: list[str]) -> int:
     with Display(Console(stderr=True)).bar(f"evaluating, suite {args.suite}") as bar:
         rollout = run_suite(scene, controller, args.suite, *size, bar)
     result = summarize(rollout, args.suite, args.duration, args.seed)
-    Console().print(evaluation_table({args.suite: result}))
+    print_table(Console(), evaluation_table({args.suite: result}))
     print(f"{result['physics_steps_per_second']:,.0f} physics steps per second", flush=True)
     if args.json:
         write_json(args.json, result)

@@ -9,6 +9,7 @@ from tyro.conf import Positional
 from mjx_balance.cli.common import check_out, complain
 from mjx_balance.errors import FAILED
 from mjx_balance.files.run_folder import write_atomically
+from mjx_balance.files.text import shell
 
 
 def robot(argv: list[str]) -> int:
@@ -59,13 +60,21 @@ def new(model: Positional[str], out: Path | None = None, strip: tuple[str, ...] 
             return complain(f"{out} exists already")
         check_out("out", out)
         if path == Path(model):
-            model = os.path.relpath(path, out.parent)
+            model = _beside(path, out.parent)
     text, problems = sketch(model, path, strip)
     if out is None:
         print(text, end="")
     else:
         write_atomically(out, text)
-        print(f"{out}: see `mjx-balance robot check {out}`")
+        print(f"{out}: see `mjx-balance robot check {shell(out)}`")
     for problem in problems:
         complain(problem)
     return FAILED if problems else 0
+
+
+def _beside(path: Path, folder: Path) -> str:
+    """A model's path for a robot file in `folder`, with slashes, as Windows takes them too."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # on another drive
+        return path.absolute().as_posix()

@@ -158,7 +158,7 @@ class _Balance:
         return tuple(self._painter.draw(state) for state in states)
 
 
-class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
+class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):  # pyright: ignore
     """A quadruped on a board that tilts in two axes: `BalanceEnv` in plain MuJoCo.
 
     A step is a decision of `ctrl_dt`. A fall terminates an episode, the time limit truncates it.
@@ -229,7 +229,7 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):
         self._window.play(qpos[0])
 
 
-class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):  # pyright: ignore
     """Many envs in `mujoco.batch.Batch`, on all cores; env k does what one alone would do.
 
     An env that terminates or is truncated starts anew as Gymnasium's `autoreset_mode` says. In mode

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mjx_balance.errors import InputError
-from mjx_balance.files.text import MESSAGE, shorten
+from mjx_balance.files.text import MESSAGE, shell, shorten
 
 if sys.platform == "win32":
     import msvcrt

@@ -1,4 +1,9 @@
-"""Shortens untrusted text to one line of a message."""
+"""Shortens untrusted text to one line of a message; quotes paths for a shell."""
+
+import os
+import shlex
+import subprocess
+from pathlib import Path
 
 MESSAGE = 300  #: greatest length of another library's error in a message, characters
 
@@ -22,3 +27,8 @@ def quote(value: object) -> str:
         return shorten(repr(value))
     except ValueError:  # an int with too many digits
         return "a number of thousands of digits"
+
+
+def shell(path: Path) -> str:
+    """Returns a path as a command's argument, quoted where the user's shell needs it."""
+    return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))

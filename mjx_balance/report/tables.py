@@ -11,6 +11,7 @@ from rich.table import Table
 
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder
+from mjx_balance.files.text import shell
 
 STATISTICS = ("mean", "p50", "p95", "p99", "max")  #: tilt statistics in the table of an evaluation
 
@@ -72,12 +73,19 @@ def spread(value: dict[str, float]) -> str:
     return f"{value['iqm']:.3f} ({value['low']:.3f}-{value['high']:.3f})"
 
 
+def print_table(console: Console, table: Table) -> None:
+    """Prints a table in full: a terminal that is too narrow breaks its lines."""
+    options = console.options.update(max_width=10**4)
+    table.width = console.measure(table, options=options).maximum
+    console.print(table, crop=False)
+
+
 def print_summary(
     console: Console, run_dir: Path, results: dict[str, dict[str, Any]], seconds: float
 ) -> None:
     """Prints a run's results, JSON of `summarize` by suite, its files and the seconds it took."""
     folder = RunFolder(run_dir)
-    console.print(evaluation_table(results))
+    print_table(console, evaluation_table(results))
     for path, what in (
         (folder.policy, "the policy; `mjx-balance evaluate` runs it"),
         (folder.evaluation, "the table above"),
@@ -87,7 +95,7 @@ def print_summary(
     ):
         console.print(f"{escape(str(path))}  [dim]{what}[/dim]", highlight=False, soft_wrap=True)
     console.print(
-        f"`mjx-balance report {run_dir}` makes a page of it", highlight=False, markup=False
+        f"`mjx-balance report {shell(run_dir)}` makes a page of it", highlight=False, markup=False
     )
     console.print(f"done in {seconds:.0f} s", highlight=False)
 

@@ -1,6 +1,7 @@
 """Builds the MuJoCo model from `scenes/*.xml`, a task and a robot; finds the standing state."""
 
 import dataclasses
+import functools
 import hashlib
 
 import mujoco
@@ -156,19 +157,20 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     trunk = model.body(f"{ROBOT}{robot.trunk}")
     root = model.joint(int(trunk.jntadr[0]))
     sensors = [model.sensor(f"{ROBOT}{name}") for name in (GYRO, ACCELEROMETER)]
+    ids = functools.partial(np.asarray, dtype=np.int32)
     layout = Layout(
         task=config.task,
         robot=robot,
         robot_source=config.robot,
         model=model,
         trunk=trunk.id,
-        leg_qpos=np.int32([[model.joint(n).qposadr[0] for n in leg] for leg in names]),
-        leg_ctrl=np.int32([[model.actuator(n).id for n in leg] for leg in names]),
-        board_qpos=np.int32([model.joint(n).qposadr[0] for n in board]),
-        board_ctrl=np.int32([model.actuator(n).id for n in board]),
-        trunk_quat=np.int32(root.qposadr[0] + np.arange(3, 7)),
-        trunk_velocity=np.int32(root.dofadr[0] + np.arange(2)),
-        imu=np.int32([k for s in sensors for k in range(s.adr[0], s.adr[0] + s.dim[0])]),
+        leg_qpos=ids([[model.joint(n).qposadr[0] for n in leg] for leg in names]),
+        leg_ctrl=ids([[model.actuator(n).id for n in leg] for leg in names]),
+        board_qpos=ids([model.joint(n).qposadr[0] for n in board]),
+        board_ctrl=ids([model.actuator(n).id for n in board]),
+        trunk_quat=ids(root.qposadr[0] + np.arange(3, 7)),
+        trunk_velocity=ids(root.dofadr[0] + np.arange(2)),
+        imu=ids([k for s in sensors for k in range(s.adr[0], s.adr[0] + s.dim[0])]),
     )
     return Scene(**vars(layout), stance=_settle(layout))
 

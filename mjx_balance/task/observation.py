@@ -157,7 +157,7 @@ def _compiled(rows: tuple[Row, ...]) -> tuple[list[_Run], Float32[np.ndarray, " 
         ages = np.arange(window)[:, None] + [row.lag for row in run]
         channels = [SENSORS[row.sensor].channel + row.index for row in run]
         # JAX mixes traces of 32 and of 64 bits up where they index by the default type.
-        runs.append(_Run(signal, offset, np.int32(ages), np.asarray(channels, np.int32)))
+        runs.append(_Run(signal, offset, ages.astype(np.int32), np.asarray(channels, np.int32)))
     return runs, np.asarray([row.scale for row in rows], np.float32)
 
 

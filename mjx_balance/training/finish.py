@@ -94,7 +94,7 @@ def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
     if config.sweep:
         ranked = _ranked(config, policies, each)
         write_json(folder.sweep, ranked)
-        console.print(tables.sweep_table(ranked))
+        tables.print_table(console, tables.sweep_table(ranked))
     results = each[best]
     folder.drawing.touch()
     write_json(folder.evaluation, results)  # before the pictures, which may fail
@@ -154,7 +154,7 @@ def _choose(run: Run, policies: list[Policy], each: list[Results]) -> int:
     values = {"best": seeds[best], "statistics": summary, "seeds": rows}
     write_json(run.folder.seeds_summary, values)
     run.display.say(f"best of the {len(policies)} seeds on the validation set: {seeds[best]}")
-    run.display.console.print(tables.seeds_table(summary))
+    tables.print_table(run.display.console, tables.seeds_table(summary))
     return best
 
 

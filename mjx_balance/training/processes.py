@@ -16,7 +16,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from mjx_balance.errors import FAILED, INTERRUPTED
-from mjx_balance.files.text import MESSAGE, shorten
+from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.machine import core_ids, cores
 from mjx_balance.training.meeting import Member, ProcessError, Watch, host, listen, visit
 
@@ -213,6 +213,7 @@ def _connect(cluster: Cluster) -> Processes:
     else:
         connections, everyone = host(address, count, own, PATIENCE_S)
     watch = Watch(connections)
+    _check_own_name()
     num_cores = share_machine(everyone, index)
     os.environ["no_grpc_proxy"] = address[0]  # noqa: SIM112
     jax.config.update("jax_check_proxy_envs", False)
@@ -226,6 +227,18 @@ def _connect(cluster: Cluster) -> Processes:
         coordinator_bind_address=service,
     )
     return Processes(index, count, watch, num_cores)
+
+
+def _check_own_name() -> None:
+    """Raises `ProcessError` if this machine's name has no address: gloo listens at it."""
+    name = socket.gethostname()
+    try:
+        socket.getaddrinfo(name, None)
+    except (OSError, UnicodeError) as error:
+        raise ProcessError(
+            f"this machine is called {quote(name)}, and no address is known for that name; add it "
+            "to /etc/hosts"
+        ) from error
 
 
 def _free_address(ip: str) -> str:

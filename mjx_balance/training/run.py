@@ -128,7 +128,7 @@ def _open_folder(
 def _announce(run: Run) -> None:
     """Logs what runs where; raises `RunFolderError` if a process cannot see the folder."""
     config, path = run.config, run.folder.path
-    run.processes.advise(f"; continue with --resume {path}")
+    run.processes.advise(f"; continue with --resume {shell(path)}")
     visible = run.processes.gather(run.folder.config.is_file())
     if not all(visible):
         raise RunFolderError(
@@ -155,7 +155,7 @@ def _locked(run: Run) -> Iterator[None]:
         except KeyboardInterrupt as error:  # the folder is whole anyway
             raise Interrupted(
                 "stopped at once; continue from the last checkpoint with --resume "
-                f"{run.folder.path}"
+                f"{shell(run.folder.path)}"
             ) from error
 
 

@@ -426,3 +426,21 @@ def test_view_shows_the_scenario_of_a_suite_and_seed(window: Callable[[str], Stu
     rollout = run_suite(scene, make_controller("none", scene), "corner", 1, 0.6, 3, record=True)
     np.testing.assert_allclose(np.concatenate(corner.shown), rollout.qpos[0], atol=1e-9)
     assert {texts[1][1] for texts in corner.said} == {"Enter: push"}
+
+
+def test_a_robot_file_finds_its_model_with_slashes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On Windows too, even from another drive, which no relative path leads to."""
+    shutil.copy(scene_dir() / "quadruped.xml", tmp_path / "dog.xml")
+    (tmp_path / "my robots").mkdir()
+
+    def windows(path: Path, folder: Path) -> str:
+        raise ValueError("path is on mount 'C:', start on mount 'D:'")
+
+    for relpath, model in ((os.path.relpath, "../dog.xml"), (windows, f"{tmp_path}/dog.xml")):
+        monkeypatch.setattr(os.path, "relpath", relpath)
+        out = tmp_path / "my robots" / f"{len(model)}.toml"
+        assert main(["robot", "new", "dog.xml", "--out", str(out)]) == 0
+        assert f'model = "{model}"' in out.read_text("utf-8")
+        assert f"robot check '{out}'`" in capsys.readouterr().out

@@ -1,6 +1,9 @@
 """Text and values from outside: made short and safe, checked against their dataclass."""
 
 import dataclasses
+import os
+import subprocess
+from pathlib import Path, PureWindowsPath
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -9,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjx_balance.errors import InputError
-from mjx_balance.files.text import quote, shorten
+from mjx_balance.files.text import quote, shell, shorten
 from mjx_balance.files.validation import STRICT, check_types, parse
 
 
@@ -110,3 +113,20 @@ def test_a_dataclass_is_checked_as_its_values_are() -> None:
         check_types(Cart((Wheel("left", -1),)), type("Own", (InputError, KeyError), {}))
     with pytest.raises(InputError, match=r"^wheels is \('round',\); each entry must be a Wheel$"):
         check_types(Cart(("round",)))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    "name", ["runs/a b", "x'y", 'q"q', "$(date)", "a;b", "-n *", "back\\slash", "ü", "plain/run-1"]
+)
+def test_a_printed_command_can_be_pasted(name: str) -> None:
+    """A shell gives the path back, as one argument and nothing else."""
+    told = subprocess.run(
+        ["sh", "-c", f"printf '%s|' --resume {shell(Path(name))}"], capture_output=True, check=True
+    )
+    assert told.stdout.decode() == f"--resume|{name}|"
+
+
+def test_a_plain_path_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert shell(Path("runs/best-seed0-20261128-120000")) == "runs/best-seed0-20261128-120000"
+    monkeypatch.setattr(os, "name", "nt")
+    assert shell(PureWindowsPath("C:/my runs/a")) == '"C:\\my runs\\a"'  # pyright: ignore

@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+import pytest
 from rich.console import Console
 
 from mjx_balance.report import tables
@@ -75,6 +76,15 @@ def test_the_summary_names_every_file_of_the_run() -> None:
     for name in ("policy.safetensors", "evaluation.json", "figures/", "metrics.jsonl"):
         assert f"runs/a[b]/{name}" in text
     assert "runs/a[b]/checkpoints/  the whole training state" in text
-    assert "`mjx-balance report runs/a[b]` makes a page of it" in text
+    assert "`mjx-balance report 'runs/a[b]'` makes a page of it" in text
     assert "0.068" in text
     assert text.endswith("done in 62 s\n")
+
+
+@pytest.mark.parametrize("width", [10, 39, 59])
+def test_a_narrow_terminal_shows_every_figure(width: int) -> None:
+    out = io.StringIO()
+    console = Console(width=width, file=out)
+    tables.print_table(console, tables.evaluation_table({"friction": FRICTION}))
+    assert "friction  100000 x 60 s   1280  0.068  0.032" in " ".join(out.getvalue().split("\n"))
+    assert "…" not in out.getvalue()

@@ -77,6 +77,19 @@ def test_two_processes_make_the_run_of_one_with_two_devices(
     assert {path.name for path in folder.path.iterdir()} == names
 
 
+def test_neither_a_proxy_nor_ipv6_is_in_the_way(
+    start_train: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A proxy at which nobody listens, for all that speak HTTP, as JAX's own service does."""
+    for name in ("http_proxy", "https_proxy", "HTTPS_PROXY", "grpc_proxy"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    with socket.create_server(("::1", 0), family=socket.AF_INET6) as server:
+        place = ["--coordinator", f"[::1]:{server.getsockname()[1]}", "--num-processes", 2]
+    flags = [*FLAGS, "--run-dir", tmp_path / "run", *place, "--process-id"]
+    for process in [start_train(*flags, k) for k in range(2)]:
+        process.end(0)
+
+
 def test_a_killed_and_a_stopped_process_lose_nothing(
     alone: RunFolder, start_two: StartTwo, tmp_path: Path, start_train: Any
 ) -> None:

@@ -1,6 +1,7 @@
 """What processes agree on, where each of them belongs, and what of a machine is its own."""
 
 import os
+import socket
 import threading
 import types
 from collections.abc import Callable, Sequence
@@ -219,3 +220,20 @@ def test_jax_finds_slurm_and_open_mpi(
     assert found == place
     assert address.startswith(host)
     assert find_cluster("other:5", None, None).coordinator_address == "other:5"
+
+
+@pytest.mark.parametrize("error", [socket.gaierror(-2, "unknown"), UnicodeError("too long")])
+def test_a_machine_whose_own_name_is_unknown_is_told(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(socket, "gethostname", lambda: "node-7\x1b")
+    monkeypatch.setattr(socket, "getaddrinfo", fail)
+    with pytest.raises(ProcessError) as refused:
+        processes._check_own_name()
+    assert str(refused.value) == (
+        r"this machine is called 'node-7\x1b', and no address is known for that name; add it to "
+        "/etc/hosts"
+    )
