@@ -132,7 +132,7 @@ def create_run_folder(
         if error.errno in (errno.EEXIST, errno.ENOTEMPTY):  # perhaps only since a moment
             raise RunFolderExistsError(
                 f"run folder {path} exists; choose another with --run-dir, or continue it with "
-                f"--resume {path}"
+                f"--resume {shell(path)}"
             ) from error
         raise RunFolderError(
             f"run folder {path} cannot be written: {error.strerror}; choose another with --run-dir"

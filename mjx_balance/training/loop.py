@@ -106,7 +106,9 @@ class Interrupts:
 
     def __enter__(self) -> "Interrupts":
         numbers = [signal.SIGINT, signal.SIGTERM]
-        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        if threading.current_thread() is not threading.main_thread():
+            numbers = []  # an app's: signals are its own
+        elif hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
             numbers.append(signal.SIGHUP)
         self._previous = {number: signal.signal(number, self._receive) for number in numbers}
         return self

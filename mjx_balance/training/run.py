@@ -170,7 +170,8 @@ def _learn(run: Run, profile: bool) -> list[Policy]:
         policies = processes.run_on_all(
             lambda: finish.export(run, state, seconds) if processes.first else [], PolicyError
         )
-        so_far = f"the policy so far is {folder.policy}; continue with --resume {folder.path}"
+        resume = f"continue with --resume {shell(folder.path)}"
+        so_far = f"the policy so far is {folder.policy}; {resume}"
         if failure := next(filter(None, processes.gather(stop.failure)), None):
             raise checkpoints.SaveError(f"{failure}; {so_far}")
         if processes.any(bool(stop)):
