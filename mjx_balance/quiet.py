@@ -39,3 +39,20 @@ def matplotlib_imports() -> Iterator[None]:
         os.environ["MPLBACKEND"] = backend
         with contextlib.suppress(ValueError):
             sys.modules["matplotlib"].rcParams["backend"] = backend
+
+
+def import_mujoco() -> None:
+    """Imports MuJoCo, also where MUJOCO_GL names a way to draw that this machine does not have.
+
+    MuJoCo then fails while it is imported, though most of what we do draws nothing. Drawing itself
+    still obeys the variable, in a process of its own, and reports the failure.
+    """
+    try:
+        import mujoco
+    except (AttributeError, RuntimeError):  # from PyOpenGL; from MuJoCo, for an unknown name
+        chosen = os.environ.pop("MUJOCO_GL", "")
+        try:
+            # Its compiled modules, which cannot be loaded twice, stay in `sys.modules`.
+            import mujoco  # noqa: F401
+        finally:
+            os.environ["MUJOCO_GL"] = chosen

@@ -61,6 +61,7 @@ class Display:
     def __init__(self, console: Console | None = None):
         """Writes to `console`; to standard output if None."""
         self.console = console or Console(file=cast(TextIO, _Output(sys.stdout)))
+        self._spinner = "line" if self.console.options.ascii_only else "dots"
         self._metrics: Mapping[str, float] = {}
 
     def say(self, message: str) -> None:
