@@ -15,6 +15,7 @@ from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files import run_folder
 from mjx_balance.files.run_folder import RunFolder, RunFolderError, RunFolderExistsError
+from mjx_balance.files.text import shell
 from mjx_balance.machine import cores
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report.progress import Display
@@ -47,7 +48,7 @@ def train(
     used, `PolicyError` if no seed learnt finite numbers, `Interrupted` if the user stopped the run.
     """
     start_time = time.perf_counter()
-    with joined(cluster, SHARED) as processes:
+    with jax.enable_x64(False), joined(cluster, SHARED) as processes:
         sizing.configure_jax(display.say, _num_cores(config, resume, processes))
         sized, env, learner = processes.run_on_all(lambda: _set_up(config), ConfigError)
         if growth := sizing.describe_growth(config, sized):

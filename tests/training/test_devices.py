@@ -321,3 +321,26 @@ def test_a_resumed_run_has_its_devices_where_there_are_fewer_cores(
     assert run._num_cores(dataclasses.replace(config, num_devices=1), here, Processes()) == 2
     assert run._num_cores(config, here, Processes(index=1, count=4, cores=1)) == 2
     assert run._num_cores(config, here, Processes(index=1, count=4, cores=3)) == 3
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(AssertionError(), ""), (RuntimeError("no\x1b[2J\n" + 500 * "x"), " (no?[2J xxx")],
+)
+def test_a_platform_that_is_not_there_is_named(
+    error: Exception, reason: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """JAX raises either, depending on the name."""
+
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setenv("MJX_BALANCE_CACHE", str(tmp_path))
+    monkeypatch.setattr(jax, "process_count", fail)
+    monkeypatch.setattr(sizing, "enable_compilation_cache", lambda log_fn: None)
+    with pytest.raises(ConfigError) as refused:
+        sizing.configure_jax(lambda line: None)
+    said = str(refused.value)
+    assert f", and JAX finds no such device{reason}" in said
+    assert said.endswith("; set JAX_PLATFORMS=cpu, or unset it")
+    assert len(said) < 300
