@@ -51,8 +51,10 @@ def new(model: Positional[str], out: Path | None = None, strip: tuple[str, ...] 
       out: File to write; none: the terminal.
       strip: Bodies to leave out, and joints to fix.
     """
+    from mjx_balance.robots.build import build
     from mjx_balance.robots.draft import sketch
     from mjx_balance.robots.model import model_path
+    from mjx_balance.robots.schema import RobotError, parse_robot_file
 
     path = model_path(model, Path())
     if out is not None:
@@ -62,6 +64,12 @@ def new(model: Positional[str], out: Path | None = None, strip: tuple[str, ...] 
         if path == Path(model):
             model = _beside(path, out.parent)
     text, problems = sketch(model, path, strip)
+    try:
+        if not problems:
+            build(parse_robot_file(text, out or Path("draft.toml")))
+    except RobotError as error:
+        problems = [str(error)]
+        text = f"# To mend: {error}.\n{text}"
     if out is None:
         print(text, end="")
     else:

@@ -303,7 +303,7 @@ def _render(
     if fixed or strip:
         entries = ", ".join((*map(_toml, strip), *fixed))
         line = f"strip = [{entries}]  # fixed; a body's name instead leaves it out"
-        lines.append(line if len(corners) == 4 else f"# {line}")
+        lines.append(f"# {line}" if problems else line)
     feet = [leg.foot for leg in legs]
     radii = [foot.radius for foot in feet]
     if feet and (np.ptp(radii) > RADIUS_TOLERANCE or not all(foot.sphere for foot in feet)):

@@ -16,6 +16,7 @@ from mjx_balance.cli import evaluate, main
 from mjx_balance.cli.common import ControllerArgs
 from mjx_balance.config import ConfigError, preset, to_dict
 from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.errors import FAILED
 from mjx_balance.evaluation.controllers import make_controller
 from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked, write_json
@@ -343,6 +344,30 @@ def test_a_full_disk_leaves_the_old_onnx_file(
     said = refuse(capsys, "export", str(SHIPPED), "--out", "p.onnx")
     assert "cannot write p.onnx: No space left on device" in said
     assert [(x.name, x.read_text()) for x in tmp_path.iterdir()] == [("p.onnx", "old")]
+
+
+def test_a_draft_is_written_though_its_model_has_to_be_mended(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Without a free joint, without a leg, with coupled joints; `--strip` mends what it can."""
+    ours = (scene_dir() / "quadruped.xml").read_text()
+    coupled = '<equality><joint joint1="LF_knee" joint2="LF_hip"/></equality></mujoco>'
+    inertial = '<inertial pos="0 0 0" mass="0.01" diaginertia="1e-5 1e-5 1e-5"/>'
+    toe = f'<body name="toe">{inertial}<joint name="toe" axis="0 1 0"/></body>'
+    models = {
+        "fixed": (('<freejoint name="root"/>', ""), "has no free joint", 4),
+        "toed": (('<geom name="LF_foot"', f'{toe}<geom name="LF_foot"'), "3 chains of three", 3),
+        "coupled": (("</mujoco>", coupled), "constraint of 'LF_knee' and 'LF_hip' couples", 4),
+    }
+    for name, (edit, problem, legs) in models.items():
+        Path(f"{name}.xml").write_text(ours.replace(*edit, 1))
+        assert main(["robot", "new", f"{name}.xml", "--out", f"{name}.toml"]) == FAILED
+        text = Path(f"{name}.toml").read_text()
+        assert (problem in text, problem in capsys.readouterr().err) == (True, True)
+        assert "# To mend: " in text
+        assert text.count("\njoints = ") == legs
+    assert main(["robot", "new", "toed.xml", "--strip", "toe", "--out", "rex.toml"]) == 0
+    assert 'strip = ["toe"]' in Path("rex.toml").read_text()
 
 
 @pytest.mark.slow

@@ -113,6 +113,10 @@ def test_six_legs_are_not_four(tmp_path: Path) -> None:
     (tmp_path / "model.xml").write_text(walker(HEXAPOD))
     with pytest.raises(RobotError, match=r"6 chains that could be legs .*: leave .* --strip NAME"):
         draft("model.xml", tmp_path / "model.xml")
+    text, _ = sketch("model.xml", tmp_path / "model.xml")
+    assert "# To mend: model.xml has 6 chains" in text
+    with pytest.raises(RobotError, match="is in no leg"):
+        build(parse_robot_file(text, tmp_path / "drafted.toml"))
     text, problems = sketch("model.xml", tmp_path / "model.xml", ["ML_hip", "MR_hip"])
     assert problems == []
     robot = build(parse_robot_file(text, tmp_path / "drafted.toml")).robot
