@@ -407,16 +407,19 @@ def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
         seconds = moments.sum() / 2 - moments
         slight = moments[0] > 0 and -seconds.min() <= SLIGHT * moments[-1]
         heavier = max(x.mass for x in _rigid(body) if x.explicitinertial) > body.mass
+        possible = np.maximum(seconds, max(0.01 * seconds.max(), 1e-6 * body.mass, 1e-12))
+        nearest = possible.sum() - possible
         if body.mass < 0 or not (slight or heavier):
-            listed = ", ".join(f"{x:.3g}" for x in moments)
+            listed, near = (", ".join(f"{x:.3g}" for x in y) for y in (moments, nearest))
+            remedy = (
+                f"the nearest are {near}" if seconds.max() > 0 else "a box has m (b^2 + c^2) / 12"
+            )
             raise RobotError(
                 f"body {quote(body.name)} of {body.mass:.3g} kg has principal moments of inertia "
                 f"{listed} kg m^2, which no body can have; each must be positive, and at most the "
-                "sum of the others: of a box a, b, c about a, m (b^2 + c^2) / 12"
+                f"sum of the others: {remedy}"
             )
-        seconds = np.maximum(seconds, max(0.01 * seconds.max(), 1e-6 * body.mass, 1e-12))
-        moments = seconds.sum() - seconds
-        near = axes * moments @ axes.T
+        near = axes * nearest @ axes.T
         if np.isnan(full[0]):
             body.inertia = near.diagonal()
         else:

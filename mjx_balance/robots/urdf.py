@@ -31,6 +31,7 @@ def read(path: Path, visual: bool) -> str:
         raise RobotError(f"{path.name} cannot be read: {message}") from error
     if any("xacro" in element.tag for element in robot.iter()):
         raise _xacro(path)
+    _free_trunk(robot)
     for shape in robot.iter("visual"):
         for repeated in shape.findall("material")[1:]:
             shape.remove(repeated)
@@ -50,6 +51,18 @@ def read(path: Path, visual: bool) -> str:
         return ElementTree.tostring(robot, encoding="unicode")
     except RecursionError:
         raise RobotError(f"{path.name}: its elements are nested too deep to be read") from None
+
+
+def _free_trunk(robot: ElementTree.Element) -> None:
+    """Makes what hangs on a floating joint a root, and drops the empty link that it hung on."""
+    for joint in [x for x in robot.findall("joint") if x.get("type") == "floating"]:
+        robot.remove(joint)
+        parent = joint.find("parent")
+        name = None if parent is None else parent.get("link")
+        ends = [x.get("link") for k in ("joint/parent", "joint/child") for x in robot.findall(k)]
+        for link in robot.findall("link"):
+            if link.get("name") == name not in ends and link.find("inertial") is None:
+                robot.remove(link)
 
 
 def _mesh_file(name: str, folders: tuple[Path, Path]) -> str:

@@ -353,8 +353,18 @@ def test_a_link_that_moves_is_mended_if_it_misses_by_little(
     if mended:
         assert drafted(tmp_path, text).notes[0].endswith("by the nearest: LF_thigh")
     else:
-        with pytest.raises(RobotError, match=r"body 'LF_thigh' of 1.15 kg .* no body can have; "):
+        near = "(the nearest are 0.015., 0.015., 0.03|a box)"
+        with pytest.raises(RobotError, match=f"'LF_thigh' of 1.15 kg .* can have; .*: {near}"):
             drafted(tmp_path, text)
+
+
+@pytest.mark.parametrize("base", ["world", "base", "odom"])
+def test_a_trunk_on_a_floating_joint(base: str, tmp_path: Path) -> None:
+    """Its root is no part of the robot."""
+    text = urdf([('name="stand" type="fixed"', 'name="stand" type="floating"')], base)
+    got = drafted(tmp_path, text)
+    assert (got.robot.trunk, got.robot.total_mass) == ("trunk", pytest.approx(TOTAL))
+    assert got.notes == []
 
 
 @pytest.mark.parametrize("mass", [0, 1e-6])
