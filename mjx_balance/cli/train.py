@@ -1,6 +1,7 @@
 """`mjx-balance train` and `mjx-balance sweep`."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 import tyro
@@ -73,8 +74,10 @@ def train(argv: list[str]) -> int:
     if args.resume and args.run_dir:
         return complain("--resume continues a folder in place; leave --run-dir out")
     robot = args.config.robot
-    if args.resume and robot.endswith(".toml") and not Path(robot).is_file():
-        return complain(f"the robot file {robot} is gone; say where it is now with --robot FILE")
+    if args.resume and robot.endswith(".toml") and not os.path.isfile(robot):
+        return complain(
+            f"the robot file {shorten(robot)} is gone; say where it is now with --robot FILE"
+        )
     try:
         with quiet_imports("torch", *unused_modules(args.config.engine)):
             import mjx_balance.training.run  # noqa: F401

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -57,10 +58,10 @@ def read_run_config(path: Path) -> Config:
     except ValueError as error:
         reason = shorten(error, MESSAGE)
         raise RunFolderError(f"{folder.config} cannot be used: {reason}") from error
-    if _is_file(config.robot) and not Path(config.robot).is_file():
+    if _is_file(config.robot) and not os.path.isfile(config.robot):
         with contextlib.suppress(ValueError, LookupError, TypeError):  # `check_same_provenance`
             began_with = read_json(folder.provenance)["robot_file"]
-            if Path(began_with).is_file():
+            if isinstance(began_with, str) and os.path.isfile(began_with):
                 return dataclasses.replace(config, robot=began_with)
     return config
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 
 from mjx_balance.files.run_folder import write_json
+from mjx_balance.files.text import shorten
 from mjx_balance.training.program_cache import CompiledProgram
 
 MEANING = {
@@ -65,14 +66,24 @@ class Profiled:
         self.calls += 1
         if self.calls != SKIPPED + 1:
             return self.program(state)
-        with jax.profiler.trace(str(self.folder)):
-            results = jax.block_until_ready(self.program(state))
+        results = None
+        try:
+            with jax.profiler.trace(str(self.folder)):
+                results = jax.block_until_ready(self.program(state))
+            self._sum_up()
+        except Exception as error:  # the trace ends no run that learns
+            if results is None:
+                raise
+            self.log_fn(f"the trace in {self.folder} cannot be summed up: {shorten(error)}")
+        return results
+
+    def _sum_up(self) -> None:
+        """Writes and logs the shares of the traced call."""
         spent = shares(self.folder, scopes(self.program.compiled.as_text() or ""))
         write_json(self.folder / "shares.json", spent)
         self.log_fn(f"a call of the training program, traced in {self.folder}:")
         for name, share in spent.items():
             self.log_fn(f"  {name:<9}{share:6.1%}  {MEANING[name]}")
-        return results
 
 
 def scopes(program: str) -> dict[str, str]:

@@ -247,7 +247,10 @@ def test_a_robot_file_is_where_the_config_says_or_where_the_run_began(
     assert read_run_config(path).robot == "rex.toml"
     for gone in (here, there):
         gone.unlink()
-    for unusable in (today, TODAY, today | {"robot_file": 3}, [], {"robot_file": None}):
+    for place in (0, 3, None, "x" * 100_000, "a\0b", ["rex.toml"], -1):
+        RunFolder(path).provenance.write_text(json.dumps(today | {"robot_file": place}))
+        assert read_run_config(path).robot == "rex.toml"
+    for unusable in (today, TODAY, []):
         RunFolder(path).provenance.write_text(json.dumps(unusable))
         assert read_run_config(path).robot == "rex.toml", "which is an error with a name"
     RunFolder(path).provenance.write_text("{")

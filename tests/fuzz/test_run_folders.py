@@ -1,6 +1,7 @@
 """Run folders of strangers: refused in a sentence, or read; nothing outside them changes."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import random
@@ -39,8 +40,9 @@ TEXTS = ("", "x" * 100_000, "\x1b[2J", "\ud800", "\u202e", "../../outside", "a\0
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that lacks its evaluation; no checkpoint is read here, so they hold next to nothing."""
-    config = to_dict(preset("smoke"))
-    folder = create_run_folder(tmp_path_factory.mktemp("whole") / "run", config, TODAY)
+    config = to_dict(dataclasses.replace(preset("smoke"), robot="rex.toml"))
+    today = TODAY | {"robot_file": "/gone/rex.toml"}
+    folder = create_run_folder(tmp_path_factory.mktemp("whole") / "run", config, today)
     tilts = dict.fromkeys(("mean", "rms", "p50", "p95", "p99", "max"), 0.1)
     result = {"scenarios": 4, "falls": 0, "tilt_deg": tilts, "action_mm_settled": 0.1}
     evaluation = {"paper": result, "corner": result}

@@ -1,14 +1,26 @@
 """What a profile makes of a trace: whose an operation is, and how long it took by itself."""
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from mjx_balance.training import profiling
-from mjx_balance.training.profiling import MEANING, SCOPES, Event, Profiled, scopes, shares
+from mjx_balance.training.profiling import (
+    MEANING,
+    SCOPES,
+    SKIPPED,
+    Event,
+    Profiled,
+    scopes,
+    shares,
+)
 from mjx_balance.training.program_cache import compile_program
 
 PROGRAM = """
@@ -70,3 +82,24 @@ def test_one_call_is_traced_and_gives_what_the_others_give(tmp_path: Path) -> No
     assert shares["physics"] > 0.5 > 5 * shares["updates"] > 0
     assert lines[0] == f"a call of the training program, traced in {tmp_path}:"
     assert lines[1] == f"  physics  {shares['physics']:6.1%}  the engine's steps"
+
+
+def test_a_trace_on_a_full_disk_ends_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that fails while it is traced fails all the same."""
+
+    @contextlib.contextmanager
+    def trace(folder: str) -> Iterator[None]:
+        yield
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(jax.profiler, "trace", trace)
+    lines: list[str] = []
+    program = compile_program(jax.jit(lambda x: (x + 1, x)), jnp.zeros(()), None, pytest.fail)
+    assert float(Profiled(program, tmp_path, lines.append, SKIPPED)(jnp.float32(3))[0]) == 4
+    reason = "[Errno 28] No space left on device"
+    assert lines == [f"the trace in {tmp_path} cannot be summed up: {reason}"]
+    failing: Any = mock.Mock(side_effect=ValueError("of the program"))
+    with pytest.raises(ValueError, match="of the program"):
+        Profiled(failing, tmp_path, lines.append, SKIPPED)(jnp.float32(3))
