@@ -1,0 +1,137 @@
+"""Policy files of strangers: refused in a sentence, or a policy that moves legs within reach."""
+
+import copy
+import json
+import random
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fixtures.policies import HEADS, random_policy, with_head
+
+from mjx_balance.config import Config
+from mjx_balance.policy.file import load_policy
+from mjx_balance.policy.manifest import PolicyError
+from mjx_balance.runtime import Controller, PolicyFileError
+
+pytestmark = pytest.mark.slow
+
+NUMBERS = (0, -1, 1, 2**31, 2**63, 10**400, 0.5, -0.0, 1e-320, 1e308, float("nan"), float("inf"))
+TEXTS = ("", "x" * 100_000, "\x1b[2J\x07", "\ud800", "\u202e", "../../p", "a\0b", "__class__")
+SECONDS = 2.0  #: of computing; a sentence comes within one, and the machine may be busy
+Parts = tuple[dict[str, Any], dict[str, Any], bytes]  #: header, manifest, numbers
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, config: Config) -> list[Parts]:
+    """Sound policies with every head, taken apart."""
+    parts = []
+    for head in HEADS:
+        file = tmp_path_factory.mktemp("whole") / "p"
+        random_policy(file, with_head(config, head, command_lags=(0, 2), imu_mean=3))
+        content = file.read_bytes()
+        size = int.from_bytes(content[:8], "little")
+        header = json.loads(content[8 : 8 + size])
+        manifest = json.loads(header.pop("__metadata__")["manifest"])
+        parts.append((header, manifest, content[8 + size :]))
+    return parts
+
+
+def change(value: Any, rng: random.Random) -> Any:
+    """JSON with something else somewhere: a value, an entry more or less, many entries."""
+    if isinstance(value, dict) and value and rng.random() < 0.95:
+        name, changed = rng.choice(sorted(value)), dict(value)
+        if rng.random() < 0.9:
+            changed[name] = change(value[name], rng)
+        else:
+            del changed[name]
+        if rng.random() < 0.1:
+            changed[rng.choice((*TEXTS, name + "s"))] = value[name]
+        return changed
+    if isinstance(value, list) and value and rng.random() < 0.8:
+        k = rng.randrange(len(value))
+        kept = value[k + rng.randrange(2) :]
+        return [*value[:k], change(value[k], rng), *kept] * rng.choice(
+            (1, 1, 1, 2, 500 if len(value) < 500 else 1)
+        )
+    if isinstance(value, int | float) and abs(value) < 1e300 and rng.random() < 0.6:
+        return rng.choice((-value, value + 1, value * 1.001, value * 10, value / 10, bool(value)))
+    lists = ([], {}, [[]] * 1_000, [0] * 20_000, json.loads("[" * 400 + "]" * 400))
+    return rng.choice((*NUMBERS, *TEXTS, None, *lists))
+
+
+def pack(parts: Parts, rng: random.Random) -> bytes:
+    """A file of changed parts: of the manifest, mostly, of the weights' entries, of all bytes."""
+    header, manifest, numbers = copy.deepcopy(parts)
+    kind = rng.random()
+    for _ in range(rng.randint(1, 3)):
+        if kind < 0.6:
+            part = rng.choice(("config", "config", "robot", *manifest))
+            manifest[part] = change(manifest[part], rng)
+        elif kind < 0.8:
+            name = rng.choice(sorted(header))
+            header[rng.choice((name, name, "spare"))] = change(header[name], rng)
+        elif kind < 0.9:
+            array = np.frombuffer(numbers, "<f4").copy()
+            array[rng.randrange(len(array)) :: rng.choice((1, 7, 10**9))] = rng.choice(
+                (0, 3e38, -3e38, 1e-40, float("nan"), float("inf"))
+            )
+            numbers = array.tobytes()
+    text = json.dumps(manifest)
+    if rng.random() < 0.05:
+        text = rng.choice((text[:-1], "[" * 90_000, "9" * 5_000, "NaN", text * 100, "[" + text))
+    metadata: Any = {"manifest": text}
+    if rng.random() < 0.02:
+        metadata = change(metadata, rng)
+    head = json.dumps({"__metadata__": metadata, **header}).encode()
+    size = len(head) if rng.random() < 0.98 else rng.choice((0, 2**40, 2**64 - 1, len(head) // 2))
+    content = size.to_bytes(8, "little") + head + numbers
+    if kind >= 0.9:
+        at = rng.randrange(len(content))
+        rest = (b"", content[at + 1 :], content[at:] + bytes(4), rng.randbytes(40))
+        content = content[:at] + bytes([rng.randrange(256)]) + rng.choice(rest)
+    return content
+
+
+def assert_moves_within_reach(controller: Controller, rng: random.Random) -> None:
+    """Whatever the network says, no target is further than a turn of the leg from the zeros."""
+    noise = np.random.default_rng(rng.randrange(2**32))
+    low, high = controller._legs.limits()
+    for _ in range(2 * controller.decision_samples + 2 if controller.decision_samples < 99 else 2):
+        samples = noise.normal((0, 0, 0, 0, 0, 9.81), 0.02)
+        targets = controller.step(controller.targets, samples[:3], samples[3:]).ravel()
+        assert np.isfinite(targets).all()
+        assert (targets >= low - 1e-9).all()
+        assert (targets <= high + 1e-9).all()
+    assert controller.reason.isprintable()
+
+
+def test_a_policy_of_a_stranger(
+    rounds: Iterator[random.Random], whole: list[Parts], tmp_path: Path
+) -> None:
+    file = tmp_path / "p.safetensors"
+    loaded = 0
+    for rng in rounds:
+        file.write_bytes(pack(rng.choice(whole), rng))
+        for load, refusal in ((load_policy, PolicyError), (Controller, PolicyFileError)):
+            began, sentence = time.process_time(), ""
+            try:
+                policy: Any = load(file)
+            except refusal as error:
+                policy, sentence = None, str(error)
+            assert time.process_time() - began < SECONDS
+            assert sentence.isprintable()
+            assert len(sentence) <= 300
+            loaded += policy is not None
+            if isinstance(policy, Controller):
+                now = iter(np.arange(100_000) * policy.sample_dt)
+                policy._clock = lambda now=now: next(now)
+                assert_moves_within_reach(policy, rng)
+            elif policy is not None:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    action = policy(np.ones((2, policy.observation_size)))
+                assert ((action >= 0) & (action < len(policy.actions))).all()
+    assert loaded, "changes as small as these leave some policies whole"
