@@ -1,5 +1,7 @@
 """Exit codes of the commands, and the base class of errors in the user's input."""
 
+from mjx_balance.files.text import MESSAGE, shorten
+
 FAILED = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -14,4 +16,10 @@ def how_to_install(extra: str) -> str:
 
 
 class InputError(ValueError):
-    """Invalid input; the message is one sentence with the value, the reason and a remedy."""
+    """Invalid input; the message is one sentence with the value, the reason and a remedy.
+
+    Values and names in it may come from strangers, so that it is shortened and printable.
+    """
+
+    def __init__(self, message: object = ""):
+        super().__init__(shorten(message, MESSAGE, tail=MESSAGE // 3))

@@ -36,8 +36,15 @@ import numpy as np
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts it"
 ACTION = "grid"  #: the only kind of action: a row of `actions.table_m`
+SENSORS = ("gyro", "accelerometer")
 IMU = 6  #: gyro x, y and z, accelerometer x, y and z
 MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
+MOST_HEADER = 8 * 2**20  #: greatest size of its header
+MOST_MESSAGE, MOST_PATH, MOST_NAME = 300, 150, 100  #: greatest lengths of texts, characters
+MOST_LEGS, MOST_LAYERS, MOST_FACTORS = 16, 64, 8
+MOST_SAMPLES = 10_000  #: greatest number of samples per decision
+LEAST_SCALE = 1e-6  #: least scale of an input; it keeps inputs finite
+MOST_TURN = 16.0  #: greatest turn of a joint at angle 0, rad; two and a half turns are 15.7
 MOST_WHOLE = 100_000  #: bound of a manifest's numbers
 MOMENTARY = ("height",)  #: sensors with one sample per decision and no history
 MOST_READ = 1_000_000  #: greatest number of samples that all inputs together average
@@ -47,6 +54,10 @@ WEIGHT = (0.5 * 9.81, 1.5 * 9.81)  #: norm of the mean acceleration, m/s^2; push
 LEAN_MOST = 40.0  #: greatest angle of it from z, deg; a fall has 6, but a push can look like 29
 AWAY_MOST = 0.5  #: greatest error of a joint at a decision, rad; pushes give 0.03
 KNEE_SLACK = 0.1  #: tolerance of a knee's reading beyond its stops, rad
+STUCK_MOST = 0.1  #: greatest motion of a target while its joint's reading stays the same, rad
+RECENT = (10, 50)  #: bounds of the number of IMU samples that are checked for repetitions
+LIVELY = 1 / 3  #: least share of different ones; there the mean tilt is a fifth greater
+LIVELY_SENSOR = 1 / 5  #: least share of new values of gyro or accelerometer; a quiet gyro has few
 LATE_SAMPLES = 5  #: greatest gap between calls, and error of a decision's length
 
 
@@ -88,26 +99,27 @@ class Controller:
         Raises:
           PolicyFileError: if the file is missing, damaged, or not a policy that this file can run.
         """
-        path = Path(path)
         try:
-            self.manifest, weights = _read(path)
+            self.manifest, weights = _read(Path(path))
             self._set_up(self.manifest, weights)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-            raise PolicyFileError(f"{path} cannot be used: {_reason(error)}") from error
+            name = _line(path, MOST_PATH)
+            message = _line(f"{name} cannot be used: {_reason(error)}", MOST_MESSAGE)
+            raise PolicyFileError(message) from error
         self._clock = clock
         self.reset()
 
     def _set_up(self, manifest: dict[str, Any], weights: dict[str, np.ndarray]) -> None:
         """Reads the manifest, and allocates the histories."""
         self._legs = legs = _Legs(manifest["robot"])
-        self.joints: list[list[str]] = [list(leg["joints"]) for leg in manifest["robot"]["legs"]]
+        self.joints: list[list[str]] = [_names(leg["joints"]) for leg in manifest["robot"]["legs"]]
         """Names of the abduction, hip and knee joints of every leg, in the order of `step`."""
-        if any(len(names) != 3 for names in self.joints):
-            raise PolicyFileError("its legs have other than three joints")
         timing = manifest["timing"]
         self.sample_dt = _number("sample_s", timing["sample_s"], 1e-4, 1)
         """Time between two IMU samples, s."""
-        self.decision_samples = _whole("decision_samples", timing["decision_samples"], 1)
+        self.decision_samples = _whole(
+            "decision_samples", timing["decision_samples"], 1, MOST_SAMPLES
+        )
         """IMU samples per decision."""
         self._decision_dt = self.decision_samples * self.sample_dt
         # The rate from a fall on one side to a fall on the other within a decision.
@@ -118,12 +130,13 @@ class Controller:
         self._height = _number("body_height_m", manifest["body_height_m"], *legs.height_range)
         if manifest["action"] != ACTION:
             raise PolicyFileError(
-                f"its action is {manifest['action']!r:.40}; this file runs {ACTION!r}"
+                f"its action is {_quote(manifest['action'])}; this file runs {ACTION!r}"
             )
         self._table = _numbers("table_m", manifest["actions"]["table_m"], (None, 2))
 
         self._inputs = inputs = _Inputs(manifest["inputs"], len(self.joints))
-        self._history = inputs.lookback("gyro", "accelerometer")
+        self._recent = min(max(self.decision_samples, RECENT[0]), RECENT[1])
+        self._history = max(inputs.lookback("gyro", "accelerometer"), self._recent)
         # The history up to the last decision, then the samples since.
         self._imu = np.empty((self._history + self.decision_samples, IMU))
         self._commands = np.empty((inputs.lookback("command"), len(self.joints)))
@@ -149,23 +162,23 @@ class Controller:
         self._commands[:] = self._height
         self._path = self._legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]
-        self._since = 0
+        self._since = self._seen = 0
         self._called = self._decided = math.nan
 
     def hold(self, reason: str) -> None:
         """Holds the targets until `reset`; does nothing if the controller already holds."""
         if self.state is not State.HOLDING:
-            self.state, self.reason = State.HOLDING, reason
+            self.state, self.reason = State.HOLDING, _line(reason, MOST_MESSAGE)
 
     def step(
         self, joint_positions: np.ndarray, gyro: np.ndarray, accelerometer: np.ndarray
     ) -> np.ndarray:
         """Processes a sample of the sensors; returns the joint targets until the next sample.
 
-        It holds if a reading is outside a sensor's range, if the IMU repeats one sample, if a call
-        comes too late, or if the sample rate is not that of training. At a decision it also holds
-        if lean, angular rate or weight are not those of a balancing robot, or if a joint is far
-        from its target.
+        It holds if a reading is not a number in a sensor's range, if a call comes too late, or if
+        the sample rate is not that of training. At a decision it also holds if too many of the
+        IMU's samples are repeated, if lean, angular rate or weight are not those of a balancing
+        robot, or if a joint is far from its target.
 
         Args:
           joint_positions: (legs, 3) abduction, hip and knee angles, rad, in the order of `joints`.
@@ -176,33 +189,43 @@ class Controller:
           (legs, 3) joint position targets, rad.
 
         Raises:
-          ValueError: if an argument has another shape.
+          ValueError: if an array of numbers has another shape.
         """
-        self._read_sensors(joint_positions, gyro, accelerometer)
-        if self.state is not State.HOLDING:
-            try:
-                self._advance(self._clock())
-            except _Unsafe as unsafe:
-                self.hold(str(unsafe))
+        try:
+            self._read_sensors(joint_positions, gyro, accelerometer)
+            if self.state is not State.HOLDING:
+                self._advance(self._time())
+        except _Unsafe as unsafe:
+            self.hold(str(unsafe))
         return self._targets.copy()
 
     def _read_sensors(self, *arguments: np.ndarray) -> None:
         """Checks shapes, and copies all readings to `_reading`: joints, gyro, accelerometer."""
-        joints, gyro, accel = (np.asarray(values, float) for values in arguments)
+        names = ("joint_positions", "gyro", "accelerometer")
+        joints, gyro, accel = (_reading(*pair) for pair in zip(names, arguments))
         if joints.shape != self._targets.shape or gyro.shape != (3,) or accel.shape != (3,):
+            shapes = [_line(x.shape, 40) for x in (joints, gyro, accel)]
             raise ValueError(
-                f"joint_positions, gyro and accelerometer have shapes {joints.shape}, {gyro.shape} "
-                f"and {accel.shape}; they must be {self._targets.shape}, (3,) and (3,)"
+                f"joint_positions, gyro and accelerometer have shapes {shapes[0]}, {shapes[1]} "
+                f"and {shapes[2]}; they must be {self._targets.shape}, (3,) and (3,)"
             )
         self._reading[:-IMU] = joints.ravel()
         self._reading[-IMU:-3] = gyro
         self._reading[-3:] = accel
 
+    def _time(self) -> float:
+        try:
+            return float(self._clock())
+        except Exception as error:  # whatever a clock raises, the legs stay where they are
+            raise _Unsafe(f"the clock gives no time: {error}") from error
+
     def _advance(self, now: float) -> None:
         """Checks the sample, decides if a decision is due, and updates the targets."""
         self._check_reading()
+        self._seen += 1
         if self.state is State.STANDING:
             self._imu[:] = self._reading[-IMU:]
+            self._joints, self._there = self._reading[:-IMU].copy(), self._targets.ravel()
             self._check_posture()
             self.state = State.BALANCING
             self._decide(now)
@@ -211,7 +234,8 @@ class Controller:
             self._imu[self._history + self._since] = self._reading[-IMU:]
             self._since += 1
             if self._since == self.decision_samples:
-                self._check_decision(now)
+                self._check_rate(now)
+                self._check_liveness()
                 self._check_posture()
                 self._decide(now)
         self._called = now
@@ -221,13 +245,17 @@ class Controller:
         sane = (self._least <= self._reading) & (self._reading <= self._most)  # NaN is not
         if sane.all():
             return
-        names = [name for leg in self.joints for name in leg]
-        names += [f"{sensor} {axis}" for sensor in ("gyro", "accelerometer") for axis in "xyz"]
         k = int(np.argmin(sane))
         raise _Unsafe(
-            f"{names[k]} reads {self._reading[k]:.3g}, which is not between {self._least[k]:.3g} "
-            f"and {self._most[k]:.3g}"
+            f"{self._name(k)} reads {self._reading[k]:.3g}, which is not between "
+            f"{self._least[k]:.3g} and {self._most[k]:.3g}"
         )
+
+    def _name(self, k: int) -> str:
+        """Name of reading `k`."""
+        names = [name for leg in self.joints for name in leg]
+        names += [f"{sensor} {axis}" for sensor in SENSORS for axis in "xyz"]
+        return names[k]
 
     def _check_time(self, now: float) -> None:
         most = LATE_SAMPLES * self.sample_dt
@@ -237,16 +265,38 @@ class Controller:
                 f"within {most:.3g} s"
             )
 
-    def _check_decision(self, now: float) -> None:
-        """Checks the sample rate since the last decision, and that the IMU's samples differ."""
+    def _check_rate(self, now: float) -> None:
+        """Checks the sample rate since the last decision."""
         took, most = now - self._decided, LATE_SAMPLES * self.sample_dt
         if abs(took - self._decision_dt) > most:
             raise _Unsafe(
                 f"{self.decision_samples} samples took {took:.3g} s; they must take "
                 f"{self._decision_dt:.3g} s within {most:.3g}, as in training"
             )
-        if (self._imu[self._history - 1 :] == self._imu[-1]).all():
-            raise _Unsafe(f"the IMU gave the same sample {self.decision_samples + 1} times")
+
+    def _check_liveness(self) -> None:
+        """Checks that the IMU's samples differ, and that joints move if their targets do."""
+        recent, count = self._imu[-self._recent :], self._recent
+        new = [len(set(map(bytes, recent)))]
+        changed = (recent[1:] != recent[:-1]).reshape(-1, 2, 3).any(axis=2)
+        new += (1 + changed.sum(axis=0)).tolist()
+        for name, value, share in zip(("IMU", *SENSORS), new, (LIVELY, *2 * (LIVELY_SENSOR,))):
+            least = max(2, round(share * count))
+            if value < least and self._seen >= count:
+                raise _Unsafe(
+                    f"the {name} repeats itself: {value} of its last {count} samples are new; at "
+                    f"least {least} must be"
+                )
+        joints, targets = self._reading[:-IMU], self._targets.ravel()
+        self._there = np.where(joints != self._joints, targets, self._there)
+        self._joints = joints.copy()
+        moved = np.abs(targets - self._there)
+        if moved.max() > STUCK_MOST:
+            k = int(moved.argmax())
+            raise _Unsafe(
+                f"{self._name(k)} reads {joints[k]:.3g} all the time, while its target moved by "
+                f"{moved[k]:.2g} rad"
+            )
 
     def _check_posture(self) -> None:
         """Checks the mean of a decision's IMU samples, and the joints, for a balancing robot."""
@@ -271,8 +321,9 @@ class Controller:
         errors = np.abs(self._reading[:-IMU] - self._targets.ravel())
         k = int(errors.argmax())
         if errors[k] > AWAY_MOST:
-            name = [name for leg in self.joints for name in leg][k]
-            raise _Unsafe(f"{name} is {errors[k]:.3g} rad from its target, more than {AWAY_MOST:g}")
+            raise _Unsafe(
+                f"{self._name(k)} is {errors[k]:.3g} rad from its target, more than {AWAY_MOST:g}"
+            )
 
     def _decide(self, now: float) -> None:
         """Chooses an action, and computes its ramp of targets, `_path`."""
@@ -308,7 +359,7 @@ class _Inputs:
             sensor = row["sensor"]
             if sensor not in channels:
                 raise PolicyFileError(
-                    f"its inputs have the sensor {sensor!r:.40}; this file knows "
+                    f"its inputs have the sensor {_quote(sensor)}; this file knows "
                     f"{', '.join(channels)}"
                 )
             index = _whole("index", row["index"], 0, channels[sensor] - 1)
@@ -322,8 +373,8 @@ class _Inputs:
         self.size = len(rows)
         self._offset = _numbers("offset", [row["offset"] for row in rows], (self.size,))
         self._scale = _numbers("scale", [row["scale"] for row in rows], (self.size,))
-        if not (self._scale > 0).all():
-            raise PolicyFileError("its scale has entries that are not above 0")
+        if not (self._scale >= LEAST_SCALE).all():
+            raise PolicyFileError(f"its scale has entries below {LEAST_SCALE:g}")
         self._groups = []
         for (sensor, window), group in groups.items():
             places, index, lags = np.asarray(group, int).T
@@ -345,9 +396,10 @@ class _Legs:
     """Leg kinematics: foot heights to joint angles and back (Leg in robots/robot.py)."""
 
     def __init__(self, robot: dict[str, Any]) -> None:
+        count = _whole("number of legs", len(robot["legs"]), 1, MOST_LEGS)
+
         def each(name: str, *shape: int) -> np.ndarray:
-            values = [leg[name] for leg in robot["legs"]]
-            return _numbers(name, values, (len(robot["legs"]), *shape))
+            return _numbers(name, [leg[name] for leg in robot["legs"]], (count, *shape))
 
         radius = _numbers("foot_radius", robot["foot_radius"], ())
         self._a, self._b, self._drop = each("thigh"), each("calf"), each("drop")
@@ -355,14 +407,20 @@ class _Legs:
         self._signs, self._zeros, self._knee = each("signs", 3), each("zeros", 3), each("knee", 2)
         if not ((self._a > 0) & (self._b > 0)).all() or not (abs(self._signs) == 1).all():
             raise PolicyFileError("its legs have lengths that are not above 0, or signs not +-1")
-        self._bends = np.sign(self._knee.sum(axis=-1))
+        if not (abs(self._zeros) <= MOST_TURN).all():
+            raise PolicyFileError(f"its legs have zeros beyond {MOST_TURN:g} rad")
+        low, high = self._knee.T
+        self._bends = np.sign(low + high)
+        one_side = (low * high >= 0) & (low <= high) & (self._bends != 0)
+        if not (one_side & (abs(self._knee) <= math.pi).all(axis=-1)).all():
+            raise PolicyFileError("its knees do not bend to one side, by at most half a turn")
         # Body height = `_rise` + distance from hip to foot, if the hip's axis is level.
         self._rise = radius + self._drop - axis_height
         self._lift = radius - axis_height
         self._sides = np.where((each("left") != 0, each("front") != 0), 1.0, -1.0)
         squared = self._a**2 + self._b**2
         squared = squared[:, None] + 2 * (self._a * self._b)[:, None] * np.cos(self._knee)
-        reach = np.sqrt(squared) + self._rise[:, None]
+        reach = np.sqrt(np.maximum(squared, 0)) + self._rise[:, None]  # rounded: -1e-17
         self.height_range = float(reach.min(axis=-1).max()), float(reach.max(axis=-1).min())
         """Least and greatest body height that all legs reach, m."""
 
@@ -399,9 +457,9 @@ class _Network:
     """The Q-network; it computes the best action only."""
 
     def __init__(self, network: Any, inputs: int, weights: dict[str, np.ndarray]) -> None:
-        self.factors = [_whole("factors", levels, 1) for levels in network["factors"]]
+        self.factors = _wholes("factors", network["factors"], MOST_FACTORS)
         self._radial = network["radial"] is True
-        hidden = [_whole("hidden_sizes", width, 1) for width in network["hidden_sizes"]]
+        hidden = _wholes("hidden_sizes", network["hidden_sizes"], MOST_LAYERS)
         rows, columns = [inputs, *hidden], [*hidden, sum(self.factors)]
         names = [f"hidden_{k}" for k in range(len(hidden))] + ["head"]
         shapes: dict[str, tuple[int, ...]] = {}
@@ -413,7 +471,7 @@ class _Network:
             shapes.update({f"{name}/kernel": (n, m), f"{name}/bias": (m,)})
         extra = sorted(set(weights) - set(shapes))
         if extra:
-            raise PolicyFileError(f"weight {extra[0]!r:.80} is none of this network's")
+            raise PolicyFileError(f"weight {_quote(extra[0])} is none of this network's")
         for name, shape in shapes.items():
             if name not in weights or weights[name].shape != shape:
                 raise PolicyFileError(f"weight {name} is missing or not of shape {shape}")
@@ -439,7 +497,7 @@ class _Network:
     def _nearest(self, out: np.ndarray, axis: int) -> int:
         """The level nearest to the best point of a radial head, whose outputs are V and mu."""
         last = np.float32(self.factors[axis] - 1)
-        return int(np.clip(np.rint((out[1 + axis] + 1) * last / 2), 0, last))
+        return int(np.rint((np.clip(out[1 + axis], -1, 1) + 1) * last / 2))
 
     def _best(self, out: np.ndarray, axis: int) -> int:
         """The level of the greatest value."""
@@ -449,23 +507,19 @@ class _Network:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Reads manifest and weights of a safetensors file: size of the header, header, numbers."""
-    try:
-        if path.exists() and not path.is_file():
-            raise PolicyFileError("it cannot be read: it is no regular file")
-        if path.stat().st_size > MOST_BYTES:
-            raise PolicyFileError(f"it has {path.stat().st_size} bytes, and no policy so many")
-        content = path.read_bytes()
-    except OSError as error:
-        raise PolicyFileError(f"it cannot be read: {error.strerror}") from error
+    content = _content(path)
     try:
         size = int.from_bytes(content[:8], "little")
         if size > len(content) - 8:
             raise ValueError("it ends within its header")
+        if size > MOST_HEADER:
+            raise ValueError(f"its header has {size} bytes, more than {MOST_HEADER}")
         header, numbers = json.loads(content[8 : 8 + size]), memoryview(content)[8 + size :]
         metadata = header.pop("__metadata__", {})
-        weights = {name: _array(name, entry, numbers) for name, entry in header.items()}
-        if sum(array.nbytes for array in weights.values()) != len(numbers):
+        ends = [entry["data_offsets"] for entry in header.values()]
+        if sum(end - begin for begin, end in ends) != len(numbers):  # before anything is copied
             raise ValueError("its length is not that of its weights")
+        weights = {name: _array(name, entry, numbers) for name, entry in header.items()}
     except PolicyFileError:
         raise
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
@@ -478,19 +532,34 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if (kind, version) != (FORMAT, FORMAT_VERSION):
         remedy = REMEDY if (kind, version) == (FORMAT, FORMAT_VERSION - 1) else ""
         raise PolicyFileError(
-            f"it is {kind!s:.40} version {version!s:.40}; this file runs {FORMAT} version "
-            f"{FORMAT_VERSION}{remedy}"
+            f"it is {_line(kind, 40)} version {_line(version, 40)}; this file runs {FORMAT} "
+            f"version {FORMAT_VERSION}{remedy}"
         )
     return manifest, weights
 
 
+def _content(path: Path) -> bytes:
+    """Reads a regular file of at most `MOST_BYTES`."""
+    try:
+        if path.exists() and not path.is_file():
+            raise PolicyFileError("it cannot be read: it is no regular file")
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)  # Linux has regular files of size 0 without end
+            size = max(len(content), os.fstat(file.fileno()).st_size)
+    except OSError as error:
+        raise PolicyFileError(f"it cannot be read: {error.strerror}") from error
+    if size > MOST_BYTES:
+        raise PolicyFileError(f"it has {size} bytes, and no policy so many")
+    return content
+
+
 def _array(name: str, entry: dict[str, Any], numbers: memoryview) -> np.ndarray:
     if entry["dtype"] != "F32":
-        kind = f"{entry['dtype']!s:.40}"
-        raise PolicyFileError(f"weight {name!r:.80} is {kind}; it must be F32 (float32)")
+        kind = _line(entry["dtype"], 40)
+        raise PolicyFileError(f"weight {_quote(name)} is {kind}; it must be F32 (float32)")
     begin, end = entry["data_offsets"]
     if not 0 <= begin <= end <= len(numbers):
-        raise ValueError(f"weight {name!r:.80} lies outside the file")
+        raise ValueError(f"weight {_quote(name)} lies outside the file")
     return np.frombuffer(numbers[begin:end], "<f4").astype(np.float32).reshape(entry["shape"])
 
 
@@ -503,18 +572,36 @@ def _reason(error: Exception) -> str:
     return f"a part of its manifest has the wrong type: {error}"
 
 
+def _reading(name: str, values: Any) -> np.ndarray:
+    """A sensor's reading as numbers; `_Unsafe` for what a broken driver may give instead."""
+    try:
+        if values is not None:  # which NumPy would take for NaN
+            return np.asarray(values, float)
+    except Exception:
+        pass
+    raise _Unsafe(f"{name} is a value of type {type(values).__name__}; it must be numbers")
+
+
 def _number(name: str, value: Any, least: float, most: float) -> float:
     if not least <= value <= most:
-        raise PolicyFileError(f"its {name} is {value}; it must be from {least:g} to {most:g}")
+        raise PolicyFileError(
+            f"its {name} is {_quote(value)}; it must be from {least:g} to {most:g}"
+        )
     return float(value)
 
 
 def _whole(name: str, value: Any, least: int, most: int = MOST_WHOLE) -> int:
     if type(value) is not int or not least <= value <= most:
         raise PolicyFileError(
-            f"its {name} is {value!r:.40}; it must be a whole number from {least} to {most}"
+            f"its {name} is {_quote(value)}; it must be a whole number from {least} to {most}"
         )
     return value
+
+
+def _wholes(name: str, values: Any, most: int) -> list[int]:
+    """Checks and returns at most so many whole numbers above 0."""
+    _whole(f"number of {name}", len(values), 0, most)
+    return [_whole(name, value, 1) for value in values]
 
 
 def _numbers(name: str, values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -524,3 +611,27 @@ def _numbers(name: str, values: Any, shape: tuple[int | None, ...]) -> np.ndarra
     if not fits or not (abs(array) < MOST_WHOLE).all():
         raise PolicyFileError(f"its {name} is not {shape} sane numbers")
     return array
+
+
+def _names(names: Any) -> list[str]:
+    """Checks and returns the names of a leg's three joints."""
+    if len(names) != 3:
+        raise PolicyFileError("its legs have other than three joints")
+    for name in names:
+        if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= MOST_NAME:
+            raise PolicyFileError(
+                f"a joint is called {_quote(name)}; a name has 1 to {MOST_NAME} printable "
+                "characters"
+            )
+    return list(names)
+
+
+def _quote(value: Any) -> str:
+    return _line(repr(value), 40)
+
+
+def _line(text: Any, most: int) -> str:
+    """Text from outside in one line without control characters; a longer one loses its middle."""
+    line = "".join(x if x.isprintable() else "?" for x in " ".join(str(text).split()))
+    rest = most // 3
+    return line if len(line) <= most else f"{line[: most - rest - 3]}...{line[-rest:]}"

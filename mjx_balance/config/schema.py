@@ -8,7 +8,7 @@ import dataclasses
 import math
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le, Lt, MinLen
+from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 
 from mjx_balance.errors import InputError
 from mjx_balance.files.validation import STRICT
@@ -19,15 +19,18 @@ LEAN = 9.81 * math.sin(DEGREE)  # m/s^2, accelerometer x or y at a tilt of 1 deg
 
 HUGE = 1e300
 """Bound of all numbers; it keeps sums of them finite."""
+MOST_COUNT = 2**53  #: bound of whole numbers; up to here a float64 holds each of them
+MOST_LAGS = 1_000
 Real = Annotated[float, Gt(-HUGE), Lt(HUGE)]
 Positive = Annotated[float, Gt(0), Lt(HUGE)]
 NonNegative = Annotated[float, Ge(0), Lt(HUGE)]
 Share = Annotated[float, Ge(0), Le(1)]
-Scale = Annotated[float, Ge(1e-6), Lt(HUGE)]
+Scale = Annotated[float, Ge(1e-6), Le(1e6)]
 Reward = Annotated[float, Ge(-1e6), Le(1e6)]
-Count = Annotated[int, Ge(1)]
-CountFrom0 = Annotated[int, Ge(0)]
-Lags = Annotated[tuple[Annotated[int, Ge(0), Le(10_000)], ...], MinLen(1)]
+Count = Annotated[int, Ge(1), Le(MOST_COUNT)]
+CountFrom0 = Annotated[int, Ge(0), Le(MOST_COUNT)]
+Lags = Annotated[tuple[Annotated[int, Ge(0), Le(10_000)], ...], Len(1, MOST_LAGS)]
+CommandLags = Annotated[tuple[Annotated[int, Ge(0), Le(1_000)], ...], MaxLen(MOST_LAGS)]
 
 
 class ConfigError(InputError):
@@ -70,7 +73,7 @@ class TaskConfig:
     """Accelerometer samples in the observation, physics steps back (paper Eq. 2)."""
     imu_mean: Annotated[int, Ge(1), Le(10_000)] = 1
     """IMU samples averaged into one input, from its lag backwards (paper Eq. 2: 1)."""
-    command_lags: tuple[Annotated[int, Ge(0), Le(1_000)], ...] = ()
+    command_lags: CommandLags = ()
     """Lags, in decisions, of the commanded foot heights in the observation: compared with the
     measured heights they show delayed actions and compliant legs (paper Eq. 2: none)."""
     height_scale: Scale = 0.01
@@ -182,7 +185,7 @@ class DQNConfig:
     exploration_noise: CountFrom0 = 0
     """Greatest number of levels by which a training action moves at random on each axis (chosen:
     0)."""
-    hidden_sizes: Annotated[tuple[Annotated[int, Ge(1), Le(65_536)], ...], MinLen(1)] = (256, 256)
+    hidden_sizes: Annotated[tuple[Annotated[int, Ge(1), Le(65_536)], ...], Len(1, 64)] = (256, 256)
     """Widths of the Q-network's hidden layers (chosen)."""
     head: Literal["joint", "factored", "radial"] = "joint"
     """How the network computes action values (dqn/networks.py): one output per action; the sum

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping
 
 from mjx_balance.config.schema import Config, ConfigError, DQNConfig
@@ -13,6 +14,7 @@ SWEEPABLE = (
 )
 """Fields of `DQNConfig` that may be arrays: they change no shape and no control flow."""
 WHOLE = ("epsilon_decay_steps",)  #: integer fields among them
+MOST_RUNS = 100_000  #: greatest number of combinations
 
 
 def sweep_grid(config: Config) -> list[dict[str, float]]:
@@ -37,6 +39,10 @@ def sweep_grid(config: Config) -> list[dict[str, float]]:
             raise ConfigError(
                 f"sweep is {quote(entry)}; after {name}= it must list numbers, as 0.1,0.4"
             ) from error
+    if math.prod(map(len, fields.values())) > MOST_RUNS:
+        raise ConfigError(
+            f"sweep is {quote(config.sweep)}; its values make more than {MOST_RUNS:,} combinations"
+        )
     grid = itertools.product(*fields.values())
     return [dict(zip(fields, values, strict=True)) for values in grid]
 

@@ -7,6 +7,7 @@ from mjx_balance.files.text import quote
 from mjx_balance.files.validation import check_types
 
 MOST_STEPS = 10_000  #: greatest number of physics steps per decision
+MOST_READ = 1_000_000  #: greatest number of IMU samples that an observation averages
 
 
 def check(config: Config) -> Config:
@@ -23,6 +24,7 @@ def check(config: Config) -> Config:
     preset(config.preset)
     _check_runs(config)
     _check_timing(config.task)
+    _check_inputs(config.task)
     _check_learning(config)
     _check_randomization(config.randomization, config.task)
     if config.export == "best" and not config.eval_every:
@@ -64,6 +66,16 @@ def _check_timing(task: TaskConfig) -> None:
         raise ConfigError(
             f"target_period is {task.target_period} s, but a board ramp may last twice the "
             f"greatest incline over board_rate, {ramp:g} s; the period must not be shorter"
+        )
+
+
+def _check_inputs(task: TaskConfig) -> None:
+    samples = 2 * (len(task.gyro_lags) + len(task.accel_lags)) * task.imu_mean
+    if samples > MOST_READ:
+        raise ConfigError(
+            f"imu_mean is {task.imu_mean}; with {len(task.gyro_lags)} gyro_lags and "
+            f"{len(task.accel_lags)} accel_lags an observation averages {samples:,} samples; it "
+            f"must be at most {MOST_READ:,}"
         )
 
 

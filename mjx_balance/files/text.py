@@ -1,24 +1,38 @@
-"""Shortens untrusted text to one line of a message; quotes paths for a shell."""
+"""Makes text from outside safe to show: one short line without control characters.
+
+It imports no other module of ours, because the errors on the ground use it. `runtime.py`, one file
+for a robot, has a copy.
+"""
 
 import os
 import shlex
 import subprocess
 from pathlib import Path
 
-MESSAGE = 300  #: greatest length of another library's error in a message, characters
+MESSAGE = 300  #: greatest length of an error message, characters
+PATH = 4096  #: of a path that a command prints for the user to copy
 
 
-def shorten(text: object, limit: int = 80) -> str:
+def printable(text: str) -> str:
+    """Returns text with "?" for control characters, which a terminal would obey, and the like."""
+    return "".join(x if x.isprintable() else "?" for x in text)
+
+
+def shorten(text: object, limit: int = 80, tail: int = 0) -> str:
     """Returns text in one line of at most `limit` characters, without control characters.
 
     Args:
       text: any object; its `str` counts.
-      limit: greatest length; longer text ends in "...".
+      limit: greatest length; "..." replaces the middle of longer text.
+      tail: number of characters at the end to keep then.
     """
-    line = " ".join(str(text)[: 4 * limit].split())
-    line = "".join(letter if letter.isprintable() else "?" for letter in line)
-    cut = len(line) > limit or len(str(text)) > 4 * limit
-    return f"{line[: limit - 3]}..." if cut else line
+    whole = str(text)
+    if len(whole) > 8 * limit:
+        whole = f"{whole[: 4 * limit]} ... {whole[-4 * limit :]}"
+    line = printable(" ".join(whole.split()))
+    if len(line) <= limit:
+        return line
+    return f"{line[: limit - tail - 3]}...{line[len(line) - tail :]}"
 
 
 def quote(value: object) -> str:
@@ -31,4 +45,5 @@ def quote(value: object) -> str:
 
 def shell(path: Path) -> str:
     """Returns a path as a command's argument, quoted where the user's shell needs it."""
-    return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))
+    name = printable(str(path))
+    return subprocess.list2cmdline([name]) if os.name == "nt" else shlex.quote(name)

@@ -16,7 +16,9 @@ from mjx_balance.policy.manifest import PolicyError, naming, upgrade
 from mjx_balance.policy.network import Policy
 
 MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
+MOST_HEADER = 8 * 2**20  #: greatest size of its header
 MOST_MANIFEST = 4 * 2**20  #: greatest size of a manifest, characters
+MOST_WEIGHTS = 1_000
 
 
 def flat_weights(params: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -86,7 +88,10 @@ def find_policy(name: str | os.PathLike[str]) -> Path:
     Raises:
       PolicyError: if there is none.
     """
-    path, shipped = Path(name), shipped_policies()
+    try:
+        path, shipped = Path(name), shipped_policies()
+    except TypeError:
+        raise PolicyError(f"policy is {quote(name)}; it must be a path or a name") from None
     try:
         for file in (path, RunFolder(path).policy):
             if file.is_file():
@@ -127,14 +132,26 @@ def read_policy(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
     Raises:
       PolicyError: if the file is not safetensors with float32 weights and a JSON manifest.
     """
-    size = path.stat().st_size
-    if size > MOST_BYTES:
-        raise PolicyError(f"{path} has {size} bytes; no policy has more than {MOST_BYTES}")
     try:
-        with naming(path), safetensors.safe_open(path, framework="numpy") as file:
-            return _manifest(file), {name: _weight(file, name) for name in file.keys()}  # noqa: SIM118
+        with naming(path):
+            _check_size(path)
+            with safetensors.safe_open(path, framework="numpy") as file:
+                manifest, names = _manifest(file), list(file.keys())
+                if len(names) > MOST_WEIGHTS:
+                    raise PolicyError(f"it has {len(names)} weights, more than {MOST_WEIGHTS}")
+                return manifest, {name: _weight(file, name) for name in names}
     except (safetensors.SafetensorError, OSError, UnicodeDecodeError) as error:
         raise PolicyError(f"{path} is damaged or no safetensors file: {error}") from error
+
+
+def _check_size(path: Path) -> None:
+    """Bounds what safetensors would read: the file, and the header, whose length comes first."""
+    with path.open("rb") as file:
+        header, size = int.from_bytes(file.read(8), "little"), path.stat().st_size
+    if size > MOST_BYTES:
+        raise PolicyError(f"it has {size} bytes; no policy has more than {MOST_BYTES}")
+    if MOST_HEADER < header <= size:
+        raise PolicyError(f"its header has {header} bytes; no policy has more than {MOST_HEADER}")
 
 
 def _manifest(file: Any) -> Any:

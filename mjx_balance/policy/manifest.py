@@ -15,7 +15,7 @@ from mjx_balance.errors import InputError
 from mjx_balance.files.text import quote
 from mjx_balance.files.validation import parse
 from mjx_balance.robots.catalogue import Robot, find_robot
-from mjx_balance.robots.limits import check_robot
+from mjx_balance.robots.limits import check_body, check_robot
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import input_rows
 
@@ -133,6 +133,7 @@ def _config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
         parse(kind, manifest.get(name), PolicyError, name=name)
     with naming("its robot"):
         robot = from_dict(Robot, manifest.get("robot"))
+        check_body(robot)
     with naming("its config"):
         return check_robot(check(from_dict(Config, manifest.get("config"))), robot), robot
 

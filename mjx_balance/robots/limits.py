@@ -5,7 +5,7 @@ import math
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig, TaskConfig
 from mjx_balance.robots.catalogue import find_robot
-from mjx_balance.robots.robot import Robot
+from mjx_balance.robots.robot import Body, Robot
 
 
 def for_robot(config: Config, robot: str) -> Config:
@@ -46,6 +46,25 @@ def greatest_incline(task: TaskConfig, robot: Robot) -> float:
 def authority(task: TaskConfig, robot: Robot) -> float:
     """Greatest board rate that the actions can follow on both axes, by the robot's lever, deg/s."""
     return math.degrees(task.action_max / task.ctrl_dt / robot.lever)
+
+
+def check_body(body: Body) -> None:
+    """Checks a body that was measured elsewhere.
+
+    Raises:
+      ConfigError: names the leg and its field.
+    """
+    for leg in body.legs:
+        low, high = leg.knee
+        if any(abs(sign) != 1 for sign in leg.signs):
+            raise ConfigError(f"signs of leg {leg.name} is {leg.signs}; each must be 1 or -1")
+        if not (low <= high and low * high > 0):
+            raise ConfigError(
+                f"knee of leg {leg.name} is {leg.knee}; it must be the least and greatest turn to "
+                "one side, both above 0 or both below"
+            )
+    if len({(leg.left, leg.front) for leg in body.legs}) < len(body.legs) or not body.lever > 0:
+        raise ConfigError("legs of the robot stand at one place; each corner must have one")
 
 
 def check_robot(config: Config, robot: Robot) -> Config:

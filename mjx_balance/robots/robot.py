@@ -5,12 +5,15 @@ import math
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Le, Len
+from annotated_types import Ge, Gt, Le, Len
 
 from mjx_balance.files.validation import STRICT
 
 MOST = 1e7  #: bound of a robot's numbers, in their units
 Number = Annotated[float, Ge(-MOST), Le(MOST)]
+Length = Annotated[float, Gt(0), Le(MOST)]
+Turn = Annotated[float, Ge(-16), Le(16)]  #: rad; two and a half turns are 15.7
+Bend = Annotated[float, Ge(-math.pi), Le(math.pi)]
 OUR_MASS, OUR_LEVER = 15.2, 0.193  #: mass and lever of our own robot, kg and m
 
 
@@ -35,18 +38,18 @@ class Leg:
     axis_height: Number  #: z of the abduction's axis, m
     drop: Number  #: distance from the abduction's axis down to the hip, m
     offset: Number  #: distance from the abduction's axis to the left, to the plane of the foot, m
-    thigh: Number  #: length from hip to knee, m
-    calf: Number  #: length from knee to the foot's centre, m
+    thigh: Length  #: length from hip to knee, m
+    calf: Length  #: length from knee to the foot's centre, m
     signs: tuple[Number, Number, Number]  #: +-1, of abduction, hip and knee
-    zeros: tuple[Number, Number, Number]  #: turns at joint angle 0, rad
-    knee: tuple[Number, Number]
+    zeros: tuple[Turn, Turn, Turn]  #: turns at joint angle 0, rad
+    knee: tuple[Bend, Bend]
     """Least and greatest turn of the calf against the thigh, rad; negative: the knee points
     backward."""
 
     def height(self, knee: float) -> float:
         """Distance from the trunk's origin down to the foot's centre at a turn of the knee, m."""
         squared = self.thigh**2 + self.calf**2 + 2 * self.thigh * self.calf * math.cos(knee)
-        return math.sqrt(squared) + self.drop - self.axis_height
+        return math.sqrt(max(squared, 0.0)) + self.drop - self.axis_height
 
 
 @dataclasses.dataclass(frozen=True)

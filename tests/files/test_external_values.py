@@ -17,6 +17,26 @@ from mjx_balance.files.validation import STRICT, check_types, parse
 
 
 @pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("abcdefghij", "abcdefghij"),
+        ("abcdefghijk", "abcd...ijk"),
+        ("\x1b" + 10**6 * "b" + "the\nend", "?bbb...end"),
+    ],
+)
+def test_the_end_of_a_long_text_can_be_kept(text: str, line: str) -> None:
+    assert shorten(text, 10, tail=3) == line
+
+
+def test_the_message_of_an_error_is_safe_whatever_it_quotes() -> None:
+    error = InputError(f"name is {10**5 * 'x'}\u202e\x1b]0;title\x07; it must be short")
+    assert len(str(error)) == 300
+    assert str(error).startswith("name is xxx")
+    assert str(error).endswith("x??]0;title?; it must be short")
+    assert str(InputError("seed is -1")) == "seed is -1"
+
+
+@pytest.mark.parametrize(
     ("text", "limit", "line"),
     [
         ("two\nlines  and\ttabs", 80, "two lines and tabs"),
