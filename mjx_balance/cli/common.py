@@ -11,6 +11,7 @@ from mjx_balance.config import check, preset
 from mjx_balance.errors import USAGE_ERROR, InputError
 from mjx_balance.evaluation import rollout
 from mjx_balance.evaluation.controllers import Controller, ControllerError, make_controller
+from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.policy.file import load_policy
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import Scene, load_scene
@@ -20,7 +21,7 @@ HELP = ("-h", "--help")
 
 def complain(message: str, code: int = USAGE_ERROR) -> int:
     """Prints an error message; returns the exit code."""
-    print(f"mjx-balance: {message}", file=sys.stderr)
+    print(f"mjx-balance: {shorten(message, MESSAGE, tail=MESSAGE // 3)}", file=sys.stderr)
     return code
 
 
@@ -49,7 +50,8 @@ class ControllerArgs:
     controller: str | None = None
     """Baseline instead of a policy: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     robot: str | None = None
-    """Robot of the baseline, or the new path of the policy's robot file."""
+    """Robot of the baseline, or of a policy whose robot is not shipped: TOML file or
+    menagerie:NAME."""
 
     def load(self) -> tuple[Scene, Controller]:
         """Loads the policy or builds the baseline, and its scene.

@@ -11,6 +11,7 @@ from mjx_balance.errors import FAILED
 from mjx_balance.evaluation.controllers import Controller
 from mjx_balance.evaluation.rollout import run_suite, summarize
 from mjx_balance.files.run_folder import write_json
+from mjx_balance.files.text import PATH, shorten
 from mjx_balance.report.progress import Display
 from mjx_balance.report.tables import evaluation_table, print_table
 from mjx_balance.sim.scene import Scene
@@ -61,5 +62,5 @@ def _video(scene: Scene, controller: Controller, args: EvaluateArgs) -> int:
         render.write(args.video, scene, rollout.qpos[0])
     except render.RenderError as error:
         return complain(f"no video written: {error}", FAILED)
-    print(f"video of the first scenario: {args.video}")
+    print(f"video of the first scenario: {shorten(args.video, PATH)}")
     return 0

@@ -8,6 +8,7 @@ import tyro
 
 from mjx_balance.cli.common import complain
 from mjx_balance.errors import how_to_install
+from mjx_balance.files.text import PATH, shorten
 from mjx_balance.policy.file import convert_policy, find_policy, load_policy
 from mjx_balance.policy.manifest import FORMAT_VERSION
 
@@ -37,7 +38,7 @@ def _write_onnx(name: Path, out: Path) -> int:
         return complain(f"export needs the package onnx ({error}); {how_to_install('onnx')}")
     policy = load_policy(name)
     size = export_onnx(policy, out)
-    print(f"{out}: {size / 1000:,.1f} kB, opset {OPSET}")
+    print(f"{shorten(out, PATH)}: {size / 1000:,.1f} kB, opset {OPSET}")
     print(
         f"observation (N, {policy.observation_size}) float32 -> "
         f"q_values (N, {len(policy.actions)}) float32, action (N,) int64"
@@ -47,6 +48,6 @@ def _write_onnx(name: Path, out: Path) -> int:
 
 def _write_safetensors(name: Path, out: Path) -> int:
     policy = convert_policy(find_policy(name), out)
-    size = out.stat().st_size
-    print(f"{out}: {size / 1000:,.1f} kB, format {FORMAT_VERSION}, weights {policy.fingerprint}")
+    size, name = out.stat().st_size, shorten(out, PATH)
+    print(f"{name}: {size / 1000:,.1f} kB, format {FORMAT_VERSION}, weights {policy.fingerprint}")
     return 0

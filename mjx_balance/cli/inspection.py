@@ -10,6 +10,7 @@ import numpy as np
 
 from mjx_balance.config import check, preset
 from mjx_balance.evaluation.suites import SUITES
+from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.robots.catalogue import robot_notes
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline, scale_ranges
 from mjx_balance.robots.measure import UNLIMITED
@@ -83,7 +84,7 @@ def _tilt_board(scene: Scene, ways: np.ndarray) -> TiltTest:
 
 def problems(scene: Scene, tilt_test: TiltTest) -> list[str]:
     """Reasons why the robot is not ready for training, one sentence each."""
-    task, name, sentences = scene.task, scene.robot.name, []
+    task, name, sentences = scene.task, shorten(scene.robot.name), []
     place = f"at {task.max_incline:g} deg on both axes"
     if tilt_test.tilt > task.fail_tilt:
         sentences.append(
@@ -92,7 +93,7 @@ def problems(scene: Scene, tilt_test: TiltTest) -> list[str]:
         )
     joint, share = _most_loaded(scene, tilt_test)
     if share >= NO_TORQUE_LEFT:
-        taken = f"{joint!r} takes {100 * share:.0f}% of its own"
+        taken = f"{quote(joint)} takes {100 * share:.0f}% of its own"
         sentences.append(f"robot {name} has no torque left {place}: {taken}")
     return sentences
 
@@ -105,17 +106,17 @@ def _most_loaded(scene: Scene, tilt_test: TiltTest) -> tuple[str, float]:
 
 def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
     """Describes the robot and the result of its tilt test, line by line."""
-    robot, task = scene.robot, scene.task
+    robot, task, name = scene.robot, scene.task, shorten(scene.robot.name)
     low, high = robot.height_range
     able, reach = authority(task, robot), greatest_incline(task, robot)
     return [
-        f"{robot.name}: {robot.total_mass:.2f} kg, of which the trunk {robot.trunk_mass:.2f}",
+        f"{name}: {robot.total_mass:.2f} kg, of which the trunk {robot.trunk_mass:.2f}",
         f"stands at {_mm(task.body_height)}; its legs reach from {_mm(low)} to {_mm(high)}",
         f"servos {robot.servo_stiffness:g} N m/rad, {robot.servo_damping:g} N m s/rad; limits "
         f"{_limit(robot.hip_torque)} (abduction, hip), {_limit(robot.knee_torque)} (knee)",
         "",
         *map(_leg, robot.legs),
-        *(f"note: {note}" for note in robot_notes(scene.robot_source)),
+        *(f"note: {shorten(note, MESSAGE)}" for note in robot_notes(scene.robot_source)),
         "",
         f"height changes up to {1000 * task.action_max:.2f} mm follow {able:.2f} deg/s, "
         f"{able / task.board_rate:.2f} of the board's {task.board_rate:g}",
@@ -131,11 +132,11 @@ def _leg(leg: Leg) -> str:
     place = f"{'front' if leg.front else 'hind'} {'left' if leg.left else 'right'}"
     ahead, side = "ahead" if leg.x > 0 else "behind", "left" if leg.y > 0 else "right"
     signs = ("+" if sign > 0 else "-" for sign in leg.signs)
-    turns = " ".join(map("".join, zip(signs, leg.joints, strict=True)))
+    turns = " ".join(map("".join, zip(signs, map(shorten, leg.joints), strict=True)))
     bend = "backward" if sum(leg.knee) < 0 else "forward"
     return (
-        f"{leg.name:>4}  {place:<10}  foot {_mm(abs(leg.x))} {ahead}, {_mm(abs(leg.y))} to the "
-        f"{side}; thigh {_mm(leg.thigh)}, calf {_mm(leg.calf)}; knee {bend}; {turns}"
+        f"{shorten(leg.name):>4}  {place:<10}  foot {_mm(abs(leg.x))} {ahead}, {_mm(abs(leg.y))} "
+        f"to the {side}; thigh {_mm(leg.thigh)}, calf {_mm(leg.calf)}; knee {bend}; {turns}"
     )
 
 
@@ -143,7 +144,7 @@ def _standing(scene: Scene, tilt_test: TiltTest) -> str:
     joint, share = _most_loaded(scene, tilt_test)
     slow = tilt_test.creep < MAX_CREEP
     still = "stands still" if slow else f"slides by {1000 * tilt_test.creep:.0f} mm/s"
-    loaded = f"the most loaded servo, {joint}, takes {100 * share:.0f}% of its torque"
+    loaded = f"the most loaded servo, {shorten(joint)}, takes {100 * share:.0f}% of its torque"
     if UNLIMITED in (scene.robot.hip_torque, scene.robot.knee_torque):
         loaded = "its model limits no torque: say hip_torque and knee_torque, in N m"
     place = f"at {scene.task.max_incline:g} deg on both axes"

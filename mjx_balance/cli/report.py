@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 
 from mjx_balance.cli.common import check_out, complain
+from mjx_balance.files.text import PATH, shorten
 from mjx_balance.report.progress import Display
 
 
@@ -21,6 +22,8 @@ class ReportArgs:
     """File to write; none: report.html in the first folder."""
     scenarios: int = 64
     """Scenarios per suite and controller."""
+    robot: str | None = None
+    """Robot of the policy, as TOML file or menagerie:NAME; none: it must be a shipped one."""
 
 
 def report(argv: list[str]) -> int:
@@ -32,8 +35,8 @@ def report(argv: list[str]) -> int:
     check_out("out", args.out)
     out = args.out or args.run_dirs[0] / "report.html"
     display = Display(Console(stderr=True))
-    missing = write_report(args.run_dirs, out, args.scenarios, display.bar)
+    missing = write_report(args.run_dirs, out, args.scenarios, display.bar, args.robot)
     for sentence in missing:
         complain(sentence)
-    print(out)
+    print(shorten(out, PATH))
     return 0

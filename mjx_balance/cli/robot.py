@@ -9,7 +9,7 @@ from tyro.conf import Positional
 from mjx_balance.cli.common import check_out, complain
 from mjx_balance.errors import FAILED
 from mjx_balance.files.run_folder import write_atomically
-from mjx_balance.files.text import shell
+from mjx_balance.files.text import PATH, shell, shorten
 
 
 def robot(argv: list[str]) -> int:
@@ -39,7 +39,7 @@ def check(robot: Positional[str], picture: Path | None = None) -> int:
         render.write(picture, scene, tilt_test.qpos[None])
     except render.RenderError as error:
         return complain(f"no picture drawn: {error}", FAILED)
-    print(f"picture: {picture}")
+    print(f"picture: {shorten(picture, PATH)}")
     return FAILED if problems else 0
 
 
@@ -74,7 +74,7 @@ def new(model: Positional[str], out: Path | None = None, strip: tuple[str, ...] 
         print(text, end="")
     else:
         write_atomically(out, text)
-        print(f"{out}: see `mjx-balance robot check {shell(out)}`")
+        print(f"{shorten(out, PATH)}: see `mjx-balance robot check {shell(out)}`")
     for problem in problems:
         complain(problem)
     return FAILED if problems else 0

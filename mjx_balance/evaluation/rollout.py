@@ -17,9 +17,10 @@ from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.errors import InputError
 from mjx_balance.evaluation.controllers import Controller, View
 from mjx_balance.evaluation.suites import draw_suite
+from mjx_balance.files.text import quote
 from mjx_balance.machine import available_memory
 from mjx_balance.policy.file import Policy, PolicyError
-from mjx_balance.robots.catalogue import RobotError, find_robot
+from mjx_balance.robots.catalogue import RobotError, find_robot, shipped
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.reward import failed
@@ -174,20 +175,32 @@ def settled_action(rollout: Rollout) -> float | None:
 
 
 def policy_scene(policy: Policy, robot: str | None = None) -> Scene:
-    """Builds the scene a policy was trained in; `robot` is the name of its robot here.
+    """Builds the scene a policy was trained in.
+
+    Args:
+      policy: from a file that anybody may have written. It names its robot, but opens no file and
+        no package: without `robot` its robot must be a shipped one.
+      robot: name of its robot here, as `Config.robot`.
 
     Raises:
       PolicyError: if the robot is not here, is another one, or today's scene files or engine
         give another scene.
     """
     name = robot or policy.config.robot
+    if robot is None and name not in shipped():
+        raise PolicyError(
+            f"the policy's robot is {quote(name)}; a policy opens no file but its own: name the "
+            "robot's file with --robot (in Python: robot=)"
+        )
     try:
         robot_here = find_robot(name)
     except RobotError as error:
-        raise PolicyError(f"the policy's robot is {policy.robot.name!r}, but {error}") from error
+        raise PolicyError(
+            f"the policy's robot is {quote(policy.robot.name)}, but {error}"
+        ) from error
     if robot_here != policy.robot:
         raise PolicyError(
-            f"the policy was trained for robot {policy.robot.name!r} "
+            f"the policy was trained for robot {quote(policy.robot.name)} "
             f"({policy.robot.total_mass:.1f} kg), and {name} is another one "
             f"({robot_here.total_mass:.1f} kg, or legs or servos that differ)"
         )
@@ -207,14 +220,17 @@ def evaluate(
     duration: float,
     seed: int,
     progress: Progress = lambda share: None,
+    robot: str | None = None,
 ) -> dict[str, Any]:
     """Evaluates a policy in plain MuJoCo; returns the JSON of `summarize`.
+
+    `robot` is as in `policy_scene`.
 
     Raises:
       EvaluationError, SuiteError: as `run_suite`.
       PolicyError: as `policy_scene`.
     """
-    scene = policy_scene(policy)
+    scene = policy_scene(policy, robot)
     rollout = run_suite(scene, observing(policy), suite, scenarios, duration, seed, progress)
     return summarize(rollout, suite, duration, seed)
 

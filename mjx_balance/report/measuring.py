@@ -15,7 +15,7 @@ from annotated_types import Len
 from mjx_balance.config import to_dict
 from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_controller
 from mjx_balance.evaluation.envelope import Envelope, envelope
-from mjx_balance.evaluation.rollout import Rollout, observing, policy_scene, run_suite, summarize
+from mjx_balance.evaluation.rollout import Rollout, observing, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import read_json, write_atomically
 from mjx_balance.files.sources import code
@@ -122,16 +122,17 @@ def _measure(
 
 
 def record_rollout(
-    policy: Policy, suite: str, duration: float, seed: int, controller: str = "policy"
+    policy: Policy,
+    scene: Scene,
+    suite: str,
+    duration: float,
+    seed: int,
+    controller: str = "policy",
 ) -> Rollout:
     """Runs one scenario of `duration` s and records every state, for a figure or a video.
 
     The controller is `policy`, or the name of a baseline to run in its place.
-
-    Raises:
-      PolicyError: if the policy belongs to another scene.
     """
-    scene = policy_scene(policy)
     acting = _controller(controller, policy, scene)
     return run_suite(scene, acting, suite, 1, duration, seed, record=True)
 

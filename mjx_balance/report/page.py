@@ -36,7 +36,11 @@ CONSTANTS = {
 
 
 def write_report(
-    run_dirs: Sequence[Path], out: Path, scenarios: int, progress: Callable[[str], Any]
+    run_dirs: Sequence[Path],
+    out: Path,
+    scenarios: int,
+    progress: Callable[[str], Any],
+    robot: str | None = None,
 ) -> list[str]:
     """Writes one self-contained HTML file; returns what is missing, one sentence each.
 
@@ -48,6 +52,7 @@ def write_report(
       out: file to write.
       scenarios: per suite and controller.
       progress: title -> context manager that gives a callable taking the share done.
+      robot: of the policy; none: it must be a shipped one.
 
     Raises:
       ReportError: for a folder that is no run folder.
@@ -69,8 +74,9 @@ def write_report(
     if first is not None and first.policy is not None:
         page["versions"] = versions(first.policy)
         try:
-            page |= _policy_sections(first, first.policy, runs, scenarios, progress)
-            page["video"] = video(first.policy)
+            scene = policy_scene(first.policy, robot)
+            page |= _policy_sections(first, first.policy, scene, runs, scenarios, progress)
+            page["video"] = video(first.policy, scene)
         except (PolicyError, ConfigError) as error:
             missing.append(f"{first.path}: {error}")
         except render.RenderError as error:
@@ -94,10 +100,15 @@ def render_page(page: dict[str, Any]) -> str:
 
 
 def _policy_sections(
-    run: Run, policy: Policy, runs: Sequence[Run], scenarios: int, progress: Callable[[str], Any]
+    run: Run,
+    policy: Policy,
+    scene: Scene,
+    runs: Sequence[Run],
+    scenarios: int,
+    progress: Callable[[str], Any],
 ) -> dict[str, Any]:
     """The page's values about a run's policy, but for the video."""
-    scene, file = policy_scene(policy), RunFolder(run.path).report
+    file = RunFolder(run.path).report
     measurements = measuring.load_or_measure(policy, scene, file, scenarios, progress)
     return {
         "policy": policy,
@@ -128,7 +139,7 @@ def policy_pictures(policy: Policy, scene: Scene, measurements: Measurements) ->
     record, seconds = measuring.record_rollout, measuring.RECORD_SECONDS
     for suite in HEADLINE:
         names = ("policy", "pd-imu")
-        rollouts = {x: record(policy, suite, seconds, SEEDS.record, x) for x in names}
+        rollouts = {x: record(policy, scene, suite, seconds, SEEDS.record, x) for x in names}
         pictures[suite] = _picture(figures.rollout_figure(scene, rollouts))
     shares = {name: np.asarray(suites["paper"]) for name, suites in measurements.shares.items()}
     tilt = figures.tilt_figure(shares, measuring.edges(fail_tilt))
@@ -136,17 +147,18 @@ def policy_pictures(policy: Policy, scene: Scene, measurements: Measurements) ->
     return pictures | {"tilt": _picture(tilt), "envelope": _picture(envelope)}
 
 
-def video(policy: Policy) -> str:
+def video(policy: Policy, scene: Scene) -> str:
     """MP4 of a scenario of suite corner, in base64.
 
     Raises:
       RenderError: if no OpenGL backend works here.
     """
-    rollout = measuring.record_rollout(policy, "corner", measuring.VIDEO_SECONDS, SEEDS.report)
+    seconds, seed = measuring.VIDEO_SECONDS, SEEDS.report
+    rollout = measuring.record_rollout(policy, scene, "corner", seconds, seed)
     assert rollout.qpos is not None
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "video.mp4"
-        render.write(file, policy_scene(policy), rollout.qpos[0])
+        render.write(file, scene, rollout.qpos[0])
         return base64.b64encode(file.read_bytes()).decode()
 
 

@@ -15,6 +15,7 @@ from rich.panel import Panel
 from rich.table import Table
 
 from mjx_balance.evaluation.suites import HEADLINE
+from mjx_balance.files.text import printable
 
 PLAIN_INTERVAL = 5.0  #: seconds between two plain lines
 METRICS = {
@@ -66,7 +67,8 @@ class Display:
 
     def say(self, message: str) -> None:
         """Prints one line."""
-        self.console.print(message, highlight=False, soft_wrap=True, markup=False)
+        text = printable(message)
+        self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:

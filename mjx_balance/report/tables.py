@@ -11,7 +11,7 @@ from rich.table import Table
 
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder
-from mjx_balance.files.text import shell
+from mjx_balance.files.text import PATH, shell, shorten
 
 STATISTICS = ("mean", "p50", "p95", "p99", "max")  #: tilt statistics in the table of an evaluation
 
@@ -93,7 +93,9 @@ def print_summary(
         (folder.metrics, f"every logged number; {folder.tensorboard.name}/ has them too"),
         (f"{folder.checkpoints}/", "the whole training state"),
     ):
-        console.print(f"{escape(str(path))}  [dim]{what}[/dim]", highlight=False, soft_wrap=True)
+        console.print(
+            f"{escape(shorten(path, PATH))}  [dim]{what}[/dim]", highlight=False, soft_wrap=True
+        )
     console.print(
         f"`mjx-balance report {shell(run_dir)}` makes a page of it", highlight=False, markup=False
     )

@@ -237,7 +237,8 @@ def _offset(model: mujoco.MjModel, data: mujoco.MjData, body: int, place: np.nda
 
 
 def _toml(name: str) -> str:
-    return json.dumps(name or NAMELESS, ensure_ascii=False)
+    text = json.dumps(name or NAMELESS, ensure_ascii=False)
+    return "".join(x if x.isprintable() else f"\\U{ord(x):08x}" for x in text)
 
 
 def _joints(model: mujoco.MjModel, joints: Iterable[int]) -> str:

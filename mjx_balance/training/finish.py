@@ -101,7 +101,7 @@ def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
     try:
         _log(results, policies[best].manifest["training"]["env_steps"], folder)
         with run.display.phase("drawing figures"):
-            _draw(folder)
+            _draw(folder, config.robot)
     except Exception as error:
         reason = shorten(error, MESSAGE) or type(error).__name__
         run.display.say(f"not all figures and curves are there: {reason}")
@@ -110,15 +110,15 @@ def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
     return results
 
 
-def _draw(folder: RunFolder) -> None:
+def _draw(folder: RunFolder, robot: str) -> None:
     from mjx_balance.report import figures, measuring  # matplotlib: not before learning begins
 
     policy = load_policy(folder.policy)
     stride = 1 + folder.metrics.stat().st_size // DRAWN_BYTES
     with folder.metrics.open(encoding="utf-8") as file:
         lines = [json.loads(line) for line in itertools.islice(file, 0, None, stride)]
-    rollout = measuring.record_rollout(policy, "paper", measuring.RECORD_SECONDS, SEEDS.record)
-    scene = evaluation.policy_scene(policy)
+    scene, seconds = evaluation.policy_scene(policy, robot), measuring.RECORD_SECONDS
+    rollout = measuring.record_rollout(policy, scene, "paper", seconds, SEEDS.record)
     figures.draw_figures(folder.figures, lines, policy.config.task, scene, {"policy": rollout})
 
 
@@ -129,7 +129,9 @@ def _evaluate(run: Run, policy: Policy, scenarios: int, seed: int) -> Results:
     results, duration = {}, run.config.eval_duration
     for suite in HEADLINE:
         with run.display.bar(f"{kind}, suite {suite}{of_seed}") as bar:
-            results[suite] = evaluation.evaluate(policy, suite, scenarios, duration, seed, bar)
+            results[suite] = evaluation.evaluate(
+                policy, suite, scenarios, duration, seed, bar, run.config.robot
+            )
     return results
 
 

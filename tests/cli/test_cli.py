@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import shutil
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from fixtures.policies import rewrite
+from rich.console import Console
 
 from mjx_balance.cli import evaluate, main
 from mjx_balance.cli.common import ControllerArgs
@@ -22,12 +25,16 @@ from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked, write_json
 from mjx_balance.policy.file import PolicyError, load_policy
 from mjx_balance.render.drawing import VIDEO_SIZE
+from mjx_balance.report.progress import Display
+from mjx_balance.report.tables import print_summary
+from mjx_balance.robots.catalogue import SHIPPED as SHIPPED_ROBOTS
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.scene import load_scene, scene_dir
 from mjx_balance.training import run
 from mjx_balance.training.checkpoints import CheckpointError, SaveError
 
-SHIPPED = Path(__file__).parents[2] / "policies" / "best.safetensors"
+REPO = Path(__file__).parents[2]
+SHIPPED = REPO / "policies" / "best.safetensors"
 
 
 @pytest.fixture(autouse=True)
@@ -399,6 +406,66 @@ def test_a_policy_stands_on_its_own_robot_alone(capsys: pytest.CaptureFixture[st
     assert "trained for robot 'quadruped' (15.2 kg), and go1 is another one (12.7 kg" in said
     flags = ["--scenarios", "1", "--duration", "1"]
     assert main(["evaluate", str(SHIPPED), "--robot", "quadruped", *flags]) == 0
+
+
+ESCAPES = "\x1b[2J\x1b]0;title\x07\x9b31m\u202e"
+
+
+def assert_safe(said: str) -> None:
+    """A terminal obeys nothing in it, and no line floods it."""
+    assert all(line.isprintable() for line in said.splitlines())
+    assert "\r" not in said
+    assert max(map(len, said.splitlines())) < 400
+
+
+def test_names_in_a_model_reach_the_terminal_as_text(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """TOML can write any character, XML some."""
+    model = (REPO / "scenes" / "quadruped.xml").read_text().replace("LF_knee", "LF\x9b31m\u202e")
+    Path("model.xml").write_text(model.replace("RF_hip", "hip" + 5_000 * "x"))
+    lines = (SHIPPED_ROBOTS / "quadruped.toml").read_text()
+    lines = lines.replace("scenes:quadruped.xml", "model.xml").replace(
+        "LF_knee", r"LF\u009b31m\u202e"
+    )
+    lines = lines.replace("RF_hip", "hip" + 5_000 * "x")
+    Path("rex.toml").write_text(lines.replace("legs.LF", r'legs."\u001b[2J\u0007LF"'))
+    main(["robot", "check", "rex.toml", "--picture", "rex.png"])
+    said = capsys.readouterr()
+    assert "?[2J?LF  front left" in said.out
+    assert_safe(said.out + said.err)
+    assert main(["robot", "new", "model.xml"]) == 0
+    drafted = capsys.readouterr().out
+    assert all(line.isprintable() for line in drafted.splitlines())
+    names = [name for leg in tomllib.loads(drafted)["legs"].values() for name in leg["joints"]]
+    assert "LF\x9b31m\u202e" in names, "and TOML gives them back"
+
+
+@pytest.mark.parametrize(
+    ("place", "field"),
+    [("", "scene_hash"), ("robot", "trunk"), ("config", "robot"), ("config", "preset")],
+)
+@pytest.mark.parametrize("text", [ESCAPES, 100_000 * "x"])
+def test_text_in_a_policy_reaches_the_terminal_as_text(
+    place: str, field: str, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(SHIPPED, "p.safetensors")
+    rewrite(Path("p.safetensors"), lambda w, m: (m[place] if place else m).update({field: text}))
+    said = refuse(capsys, "evaluate", "p.safetensors", "--scenarios", "1", "--duration", "1")
+    assert_safe(said)
+
+
+def test_a_folders_name_reaches_the_terminal_as_text(capsys: pytest.CaptureFixture[str]) -> None:
+    folder = Path(f"runs{ESCAPES}")
+    folder.mkdir()
+    for command in ("evaluate", "report", "view"):
+        assert main([command, str(folder)]) == 2
+    assert main(["report", str(folder), "--out", str(folder / "none" / "page.html")]) == 2
+    print_summary(Console(), folder, {}, 1.0)
+    Display(Console()).say(f"{folder}: preset default")
+    said = capsys.readouterr()
+    assert_safe(said.out + said.err)
+    assert said.out.count("runs?[2J") == 7
 
 
 class StubWindow:

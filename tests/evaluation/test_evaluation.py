@@ -3,6 +3,8 @@
 import copy
 import dataclasses
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +15,10 @@ import mujoco
 import numpy as np
 import psutil
 import pytest
+from fixtures.policies import random_params, random_policy, rewrite
 from scipy.spatial.transform import Rotation
 
+from mjx_balance.cli.common import ControllerArgs
 from mjx_balance.config import Config
 from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.evaluation import envelope as envelope_module
@@ -32,7 +36,9 @@ from mjx_balance.evaluation.rollout import (
     summarize,
 )
 from mjx_balance.evaluation.suites import draw_suite
-from mjx_balance.policy.file import PolicyError, load_policy
+from mjx_balance.policy.file import PolicyError, load_policy, save_policy
+from mjx_balance.policy.manifest import make_manifest
+from mjx_balance.robots.catalogue import SHIPPED as SHIPPED_ROBOTS
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.observation import observation_names
@@ -537,6 +543,53 @@ def test_a_policy_of_another_scene_is_refused() -> None:
 def test_a_policy_whose_robot_is_gone_is_refused() -> None:
     with pytest.raises(PolicyError, match="the policy's robot is 'quadruped', but robot is 'rex'"):
         policy_scene(load_policy("best"), "rex")
+
+
+STRANGERS = ("rex.toml", "{here}/rex.toml", "menagerie:unitree_go1", "/dev/stdin.toml", "rex", "")
+
+
+@pytest.mark.parametrize("name", STRANGERS)
+def test_what_a_policy_names_is_not_opened(
+    name: str, tmp_path: Path, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a scene, an evaluation, a picture; its robot's file would import a module that counts."""
+    (tmp_path / "counted.py").write_text("open('imported', 'w')")
+    text = (SHIPPED_ROBOTS / "quadruped.toml").read_text()
+    model = 'model = "scenes:quadruped.xml"'
+    (tmp_path / "rex.toml").write_text(text.replace(model, 'model = "counted.x:y.xml"'))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    modules = ("counted", "mujoco_menagerie")
+    for module in modules:
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    random_policy(tmp_path / "p", config)
+    name = name.format(here=tmp_path)
+    rewrite(tmp_path / "p", lambda w, m: m["config"].update(robot=name))
+    policy = load_policy("p")
+    sentence = "; a policy opens no file but its own: name the robot's file with --robot"
+    for attempt in (
+        lambda: policy_scene(policy),
+        lambda: evaluate(policy, "paper", 1, 1.0, 0),
+        lambda: ControllerArgs(policy=tmp_path / "p").load(),
+    ):
+        with pytest.raises(PolicyError, match=f"robot is {re.escape(repr(name))}{sentence}"):
+            attempt()
+    assert not (tmp_path / "imported").exists()
+    assert not set(modules) & set(sys.modules)
+
+
+def test_the_robot_of_a_policy_is_the_one_that_the_user_names(
+    tmp_path: Path, config: Config, scene: Scene
+) -> None:
+    """Whatever the policy calls it, and from wherever its file is."""
+    save_policy(tmp_path / "p", random_params(config), make_manifest(config, scene.hash, {}))
+    rewrite(tmp_path / "p", lambda w, m: m["config"].update(robot="gone/quadruped.toml"))
+    shutil.copy(SHIPPED_ROBOTS / "quadruped.toml", tmp_path)
+    mine = str(tmp_path / "quadruped.toml")
+    here, _ = ControllerArgs(policy=tmp_path / "p", robot=mine).load()
+    assert here.hash == scene.hash
+    result = evaluate(load_policy(tmp_path / "p"), "paper", 1, 1.0, 0, robot=mine)
+    assert result["scenarios"] == 1
 
 
 def test_the_command_writes_the_contract_and_imports_no_jax(tmp_path: Path) -> None:

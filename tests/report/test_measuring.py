@@ -202,9 +202,9 @@ def test_a_folder_that_cannot_be_written_is_measured_all_the_same(
     assert list(measure(5).results) == list(NAMES)
 
 
-def test_one_recorded_scenario(policy: Policy, calls: list[tuple]) -> None:
-    measuring.record_rollout(policy, "corner", 12.0, 7)
-    measuring.record_rollout(policy, "paper", 100.0, 8, "pd-imu")
+def test_one_recorded_scenario(policy: Policy, scene: Scene, calls: list[tuple]) -> None:
+    measuring.record_rollout(policy, scene, "corner", 12.0, 7)
+    measuring.record_rollout(policy, scene, "paper", 100.0, 8, "pd-imu")
     assert [call[1:] for call in calls] == [
         ("corner", 1, 12.0, 7, True),
         ("paper", 1, 100.0, 8, True),

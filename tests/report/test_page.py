@@ -220,7 +220,7 @@ def test_the_pictures_of_a_policy(
         "envelope": "envelope_figure",
     }
     for suite, given in zip(("paper", "corner"), drawn, strict=False):
-        both = {n: (policy, suite, 100.0, 2_000_000, n) for n in ("policy", "pd-imu")}
+        both = {n: (policy, scene, suite, 100.0, 2_000_000, n) for n in ("policy", "pd-imu")}
         assert given == (scene, both), "both on the same scenario"
     shares, edges = drawn[2]
     assert list(shares) == list(measurements.results)
@@ -230,7 +230,7 @@ def test_the_pictures_of_a_policy(
 
 
 def test_the_video_is_of_a_scenario_that_was_measured(
-    policy: Policy, monkeypatch: pytest.MonkeyPatch
+    policy: Policy, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple] = []
 
@@ -244,8 +244,8 @@ def test_the_video_is_of_a_scenario_that_was_measured(
 
     monkeypatch.setattr(measuring, "record_rollout", recorded)
     monkeypatch.setattr(page.render, "write", write)
-    assert base64.b64decode(page.video(policy)) == b"film"
-    assert asked == [(policy, "corner", 12.0, 4_000_000)]
+    assert base64.b64decode(page.video(policy, scene)) == b"film"
+    assert asked == [(policy, scene, "corner", 12.0, 4_000_000)]
 
 
 @pytest.mark.slow
@@ -258,7 +258,7 @@ def test_the_first_run_that_has_a_policy_is_shown(
         asked.append(given)
         return made_up(policy)
 
-    def no_video(policy: Policy) -> str:
+    def no_video(policy: Policy, scene: Scene) -> str:
         raise RenderError("no screen")
 
     monkeypatch.setattr(measuring, "load_or_measure", measured)

@@ -106,8 +106,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     asked: list[Any] = []
 
     def evaluate(
-        policy: Policy, suite: str, scenarios: int, duration: float, seed: int, bar: Any
+        policy: Policy, suite: str, scenarios: int, duration: float, seed: int, bar: Any, robot: str
     ) -> dict[str, Any]:
+        assert robot == CONFIG.robot
         asked.append((policy.config.seed, suite, scenarios, duration, seed))
         bar(1.0)
         falls, mean = VALIDATION[policy.config.seed]
@@ -115,7 +116,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
             falls, mean = 7, 1 - mean
         return result(suite, falls, mean, seed)
 
-    def draw(folder: RunFolder) -> None:
+    def draw(folder: RunFolder, robot: str) -> None:
+        assert robot == CONFIG.robot
         assert folder.evaluation.exists()
         asked.append(("figures", load_policy(folder.policy).config.seed))
 
@@ -192,11 +194,11 @@ def test_figures_are_of_the_metrics_and_of_a_scenario_of_their_own(
     record = lambda policy, *given: (policy.fingerprint, *given)  # noqa: E731
     monkeypatch.setattr(measuring, "record_rollout", record)
     monkeypatch.setattr(figures, "draw_figures", lambda *given: drawn.append(given))
-    monkeypatch.setattr(finish.evaluation, "policy_scene", lambda policy: policy.scene_hash)
-    finish._draw(folder)
-    rollouts = {"policy": (policy.fingerprint, "paper", 100.0, 2_000_000)}
+    monkeypatch.setattr(finish.evaluation, "policy_scene", lambda policy, robot: robot)
+    finish._draw(folder, "rex.toml")
+    rollouts = {"policy": (policy.fingerprint, "rex.toml", "paper", 100.0, 2_000_000)}
     lines = [{"env_steps": 1}, {"env_steps": 2}]
-    assert drawn == [(folder.figures, lines, CONFIG.task, "hash", rollouts)]
+    assert drawn == [(folder.figures, lines, CONFIG.task, "rex.toml", rollouts)]
 
 
 def test_a_run_killed_while_it_finishes_finishes_again(
