@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.robots.measure import JOINT_ACTUATORS, check_joints, measure, pose
-from mjx_balance.robots.model import FRESH, Coupling, compile_model, model_path, read_model
+from mjx_balance.robots.model import FRESH, Coupling, compile_model, model_path, naming, read_model
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import FixedJoint, Foot, LegFile, RobotError, RobotFile
 
@@ -44,7 +44,8 @@ def build(file: RobotFile, visual: bool = False) -> Build:
       RobotError: if file and model do not match, or the model is no four-legged robot.
     """
     try:
-        return _build(file, visual)
+        with naming("its model cannot be built"):
+            return _build(file, visual)
     except RobotError as error:
         raise RobotError(f"robot {file.name}: {error}") from error
 

@@ -12,7 +12,7 @@ import numpy as np
 from mjx_balance.files.text import quote, shorten
 from mjx_balance.robots.build import RADIUS_TOLERANCE, strip_elements
 from mjx_balance.robots.measure import ancestors
-from mjx_balance.robots.model import compile_model, read_model
+from mjx_balance.robots.model import compile_model, naming, read_model
 from mjx_balance.robots.schema import RobotError, parse_robot_file
 
 HEADER = """\
@@ -78,6 +78,11 @@ def sketch(model: str, path: Path, strip: Sequence[str] = ()) -> tuple[str, list
     Raises:
       RobotError: if the model cannot be read, or has nothing that could be a leg.
     """
+    with naming(f"{path.name} cannot be drafted from"):
+        return _sketch(model, path, strip)
+
+
+def _sketch(model: str, path: Path, strip: Sequence[str]) -> tuple[str, list[str]]:
     spec = read_model(path).spec
     strip_elements(spec, strip)
     problems = []

@@ -1,10 +1,12 @@
 """Finds, bounds, reads and mends a maker's model; nothing of it is run, and nothing imported."""
 
+import contextlib
 import html
 import importlib.util
 import math
+import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +16,7 @@ import numpy as np
 from mjx_balance.errors import how_to_install
 from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.robots import urdf
+from mjx_balance.robots.robot import MOST
 from mjx_balance.robots.schema import RobotError
 
 FRESH = mujoco.MjSpec()  #: MuJoCo's own defaults, for elements that we add to a maker's model
@@ -24,6 +27,10 @@ REMOVED = (
 """Elements of the maker's model that are removed; what refers to others goes before those."""
 SIZES = ("nkey", "nconmax", "njmax", "nuserdata", "memory")
 SIZES += tuple(name for name in dir(FRESH) if name.startswith("nuser_"))
+
+BOUNDED = ("body_pos", "body_ipos", "body_mass", "body_inertia", "geom_pos", "geom_size")
+BOUNDED += ("site_pos", "jnt_pos", "mesh_vert", "actuator_gear", "actuator_gainprm")
+"""Fields of a compiled model that must not exceed `MOST`, in SI units."""
 
 MAX_TEXT = 2**24  #: greatest size of a model's XML, with all that it includes, bytes
 MAX_COPIES = 10_000  #: greatest product of the counts that an XML asks to repeat elements by
@@ -82,7 +89,7 @@ def model_path(model: str, folder: Path) -> Path:
         path = _menagerie(inside)
     else:
         path = _package(where, model) / inside
-    if "\0" in model or not path.is_file():
+    if not os.path.isfile(path):  # False for a name that no file can have
         raise RobotError(f"model is {quote(model)}, but there is no file {shorten(path, MESSAGE)}")
     return path
 
@@ -132,13 +139,17 @@ def read_model(path: Path, visual: bool = False) -> Model:
       RobotError: if it is too large, unreadable, or a link cannot have the inertia that it has.
     """
     _check_text(path)
+    with naming(f"{path.name} cannot be read"):
+        return _read(path, visual)
+
+
+def _read(path: Path, visual: bool) -> Model:
     is_urdf = path.suffix.lower() in (".urdf", ".xacro")
     if is_urdf:
-        text = urdf.read(path, visual)
-        spec = _parse(lambda: mujoco.MjSpec.from_string(text), path)
+        spec = mujoco.MjSpec.from_string(urdf.read(path, visual))
         spec.modelfiledir = f"{path.parent}/"
     else:
-        spec = _parse(lambda: mujoco.MjSpec.from_file(str(path)), path)
+        spec = mujoco.MjSpec.from_file(str(path))
     spec.compiler.discardvisual = spec.compiler.fusestatic = False  # True by default for URDF
     _check_elements(spec, path)
     couplings = tuple(_couplings(spec))
@@ -153,25 +164,34 @@ def read_model(path: Path, visual: bool = False) -> Model:
     return Model(spec, couplings, notes)
 
 
-def _parse(read: Callable[[], mujoco.MjSpec], path: Path) -> mujoco.MjSpec:
+@contextlib.contextmanager
+def naming(subject: str) -> Iterator[None]:
+    """Raises errors of MuJoCo, which any access to a spec may raise, as `RobotError`.
+
+    Its warnings are dropped, or a NaN in a model would write MUJOCO_LOG.TXT.
+    """
     warn = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)  # else a NaN in it writes MUJOCO_LOG.TXT
+    mujoco.set_mju_user_warning(lambda _: None)
     try:
-        return read()
+        yield
+    except RobotError:
+        raise
     except (ValueError, RuntimeError, mujoco.FatalError, MemoryError) as error:
-        raise RobotError(f"{path.name} cannot be read: {_mujoco_message(error)}") from error
+        message = _mujoco_message(error)
+        remedy = next((words for part, words in REMEDIES.items() if part in message), "")
+        raise RobotError(f"{subject}: {message}{remedy}") from error
     finally:
         mujoco.set_mju_user_warning(warn)
 
 
 def compile_model(spec: mujoco.MjSpec, subject: str = "its model") -> mujoco.MjModel:
     """Compiles a model; raises `RobotError` with MuJoCo's message about `subject`."""
-    try:
-        return spec.compile()
-    except (ValueError, RuntimeError, mujoco.FatalError, MemoryError) as error:
-        message = _mujoco_message(error)
-        remedy = next((words for part, words in REMEDIES.items() if part in message), "")
-        raise RobotError(f"{subject} cannot be compiled: {message}{remedy}") from error
+    with naming(f"{subject} cannot be compiled"):
+        model = spec.compile()
+    for field in BOUNDED:
+        if not (np.abs(getattr(model, field)) <= MOST).all():
+            raise RobotError(f"{subject} has a {field} above {MOST:g}")
+    return model
 
 
 REMEDIES = {
@@ -199,7 +219,7 @@ def _check_text(path: Path) -> None:
     """Bounds what reading a file can take: its size, its files' sizes, and copies of elements."""
     files, size, copies = [path], 0, 1
     for file in files:  # grows by what is included
-        if not file.is_file():
+        if not os.path.isfile(file):
             raise RobotError(f"{path.name} includes {quote(str(file))}, which is no regular file")
         size += file.stat().st_size
         if size > MAX_TEXT:
@@ -219,7 +239,9 @@ def _check_text(path: Path) -> None:
             values = {name: first or second for name, first, second in pairs}
             if tag in (b"include", b"model"):
                 places = {folder / values.get("file", "") for folder in (path.parent, file.parent)}
-                files += [x for x in places if x.exists() and x not in files and not x.is_dir()]
+                files += [
+                    x for x in places - {*files} if os.path.exists(x) and not os.path.isdir(x)
+                ]
             elif tag == b"hfield":
                 points = math.prod(_integers(f"{values.get('nrow', 0)} {values.get('ncol', 0)}"))
                 if points > MAX_PIXELS:
@@ -333,7 +355,7 @@ def _readable(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
     if not mesh.file:
         return True
     path = _file(spec, mesh)
-    if not path.is_file() or path.stat().st_size > MAX_MESH:
+    if not os.path.isfile(path) or path.stat().st_size > MAX_MESH:
         return False
     if path.suffix.lower() != ".stl":
         return bool(mesh.content_type) or path.suffix.lower() in (".obj", ".msh")
@@ -347,7 +369,7 @@ def _drawable(spec: mujoco.MjSpec, texture: mujoco.MjsTexture) -> bool:
     pixels = texture.width * texture.height
     for name in filter(None, (texture.file, *texture.cubefiles)):
         path = _file(spec, texture).parent / Path(name).name
-        if not path.is_file():
+        if not os.path.isfile(path):
             return False
         with path.open("rb") as file:
             head = file.read(24)

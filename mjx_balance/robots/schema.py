@@ -1,6 +1,7 @@
 """Fields and parser of a robot's TOML file."""
 
 import dataclasses
+import os
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -112,7 +113,7 @@ def read_robot_file(path: Path) -> RobotFile:
       RobotError: if it is missing, unreadable or invalid.
     """
     try:
-        if path.exists() and not path.is_file():
+        if os.path.exists(path) and not os.path.isfile(path):
             raise RobotError(f"{path} is no regular file")
         with path.open("rb") as file:
             text = file.read(MAX_FILE + 1).decode("utf-8-sig")

@@ -80,7 +80,7 @@ def _mesh_file(name: str, folders: tuple[Path, Path]) -> str:
     else:
         name = name.removeprefix("file://")
         paths = [folder / part for folder in folders for part in (name, Path(name).name)]
-    return next((str(x.absolute()) for x in paths if x.is_file()), name)
+    return next((str(x.absolute()) for x in paths if os.path.isfile(x)), name)
 
 
 def _xacro(path: Path) -> RobotError:

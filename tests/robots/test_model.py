@@ -544,3 +544,27 @@ def test_a_mass_that_no_body_of_its_size_has(tmp_path: Path) -> None:
     text = urdf([fixed("head", "trunk", inertial(100.0, 0.03, 0.03, 0.03))])
     notes = drafted(tmp_path, text).notes
     assert notes[0] == "denser than any metal, by their moments of inertia: head 100 kg"
+
+
+@pytest.mark.parametrize(
+    ("edits", "message"),
+    [
+        ([('name="LF_knee"', 'name="LF_hip"')], "repeated name 'LF_hip' in joint"),
+        ([('xyz="0 0 -0.213"', 'xyz="0 0 -1e308"')], "a body_pos above 1e"),
+        ([('xyz="0 0 -0.213"', 'xyz="0 nan 0"')], r"model.urdf"),
+        (
+            [('<mass value="6.92"/>', '<mass value="inf"/>')],
+            "has a body_mass above 1e",
+        ),
+    ],
+)
+def test_broken_models_end_in_a_sentence(edits: Edits, message: str, tmp_path: Path) -> None:
+    """Found by tests/fuzz."""
+    with pytest.raises(RobotError, match=message):
+        drafted(tmp_path, urdf(edits))
+
+
+def test_a_name_that_no_file_can_have() -> None:
+    with pytest.raises(RobotError, match=r"there is no file .*xxx\.\.\.$") as caught:
+        model_path("x" * 5000, Path())
+    assert len(str(caught.value)) <= 300
