@@ -4,14 +4,17 @@ A checkpoint is a folder named by the decisions so far, with orbax's files in `s
 checksum of them in `sum`, which is compared before anything is read.
 """
 
+import contextlib
 import errno
 import hashlib
 import logging
 import os
 import shutil
-from collections.abc import Callable
+import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import orbax.checkpoint as ocp
 
@@ -21,6 +24,7 @@ from mjx_balance.training.processes import ALONE, Processes
 
 T = TypeVar("T")
 
+REMOVAL_S = 5.0  #: longest time to remove an incomplete checkpoint, s
 NEWEST = 2  #: checkpoints that stay: one, and one to fall back on
 
 
@@ -57,13 +61,38 @@ def save(directory: Path, env_steps: int, state: object, processes: Processes = 
 
     try:
         if processes.broadcast(begin, OSError):
-            with _checkpointer() as checkpointer:
+            with _no_echoes(), _checkpointer() as checkpointer:
                 checkpointer.save((part / "state").resolve(), state)
             processes.broadcast(end, OSError)
     except Exception as error:  # whatever orbax raises on a full disk, say
-        if processes.first and _is_ours(part):
-            shutil.rmtree(part, ignore_errors=True)
+        if processes.first:
+            _remove(part)
         raise SaveError(f"the checkpoint {path} cannot be written: {_reason(error)}") from error
+
+
+@contextlib.contextmanager
+def _no_echoes() -> Iterator[None]:
+    """Hides the errors of writes that fail after the first, for which orbax does not wait.
+
+    TensorStore prints them, also a moment later.
+    """
+    hook = sys.unraisablehook
+
+    def others(raised: Any) -> None:
+        if str(raised.exc_value) != "Event loop is closed":
+            hook(raised)
+
+    sys.unraisablehook = others
+    yield
+    sys.unraisablehook = hook  # not after a failure
+
+
+def _remove(part: Path) -> None:
+    """Removes what a failed save leaves, into which threads may still write for a moment."""
+    until = time.monotonic() + REMOVAL_S
+    while _is_ours(part) and time.monotonic() < until:
+        shutil.rmtree(part, ignore_errors=True)
+        time.sleep(0.1)
 
 
 def _reason(error: Exception) -> str:
@@ -147,5 +176,6 @@ def _sum(folder: Path) -> str:
 
 
 def _checkpointer() -> ocp.Checkpointer:
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # what fails is raised too
+    for name in ("absl", "asyncio", "concurrent.futures"):  # what fails is raised too
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     return ocp.Checkpointer(ocp.StandardCheckpointHandler())

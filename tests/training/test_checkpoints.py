@@ -4,10 +4,11 @@ import dataclasses
 import os
 import resource
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import hypothesis.strategies as st
 import jax
@@ -102,21 +103,25 @@ def test_what_cannot_be_written_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_a_sentence_and_leaves_the_one_before(
-    folder: Path, caplog: pytest.LogCaptureFixture
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """No file may have more than 2,000 bytes, which the system refuses as it does a full disk."""
+    printed: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", printed.append)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2_000, before[1]))
     numbers = np.random.default_rng(0).random(100_000, np.float32)  # cannot be compressed
+    state = State({f"kernel {k}": jnp.asarray(numbers) for k in range(8)}, jnp.int32(20))
     try:
         with pytest.raises(SaveError) as error:
-            save(folder, 20, State({"kernel": jnp.asarray(numbers)}, jnp.int32(20)))
+            save(folder, 20, state)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert str(error.value) == f"the checkpoint {folder / '20'} cannot be written: File too large"
     assert sorted(os.listdir(folder)) == ["10", "5"]
     assert restored(folder) == 10
     assert not caplog.records
+    assert not printed
 
 
 def test_what_is_not_ours_is_neither_read_nor_deleted(folder: Path, tmp_path: Path) -> None:
