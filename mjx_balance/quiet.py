@@ -52,7 +52,11 @@ def import_mujoco() -> None:
     except (AttributeError, RuntimeError):  # from PyOpenGL; from MuJoCo, for an unknown name
         chosen = os.environ.pop("MUJOCO_GL", "")
         try:
-            # Its compiled modules, which cannot be loaded twice, stay in `sys.modules`.
-            import mujoco  # noqa: F401
+            import mujoco
         finally:
             os.environ["MUJOCO_GL"] = chosen
+        # Its compiled modules cannot be loaded twice: the first attempt has left them here.
+        for name, module in list(sys.modules.items()):
+            parent, _, own = name.rpartition(".")
+            if parent == "mujoco":
+                setattr(mujoco, own, module)

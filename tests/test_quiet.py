@@ -38,7 +38,9 @@ def test_pytorch_that_is_in_use_stays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 DRAWS_NOTHING = """
-import mjx_balance, os, mujoco, mujoco.batch
+import mjx_balance, os, sys, mujoco, mujoco.batch
+own = [x.rpartition(".")[2] for x in sys.modules if x.rpartition(".")[0] == "mujoco"]
+assert "_enums" in own and all(hasattr(mujoco, x) for x in own)  # MJX asks for them so
 model = mujoco.MjModel.from_xml_string("<mujoco/>")
 print(mujoco.batch.Batch(model, 2, 1).qpos.shape, os.environ["MUJOCO_GL"])
 """
