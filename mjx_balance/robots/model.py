@@ -344,17 +344,18 @@ def _drop_unreadable(spec: mujoco.MjSpec) -> list[str]:
     return [f"not shown, for they are no readable STL, OBJ or MSH files: {files}"] if gone else []
 
 
-def _file(spec: mujoco.MjSpec, element: mujoco.MjsMesh | mujoco.MjsTexture) -> Path:
+def _file(spec: mujoco.MjSpec, element: mujoco.MjsMesh | mujoco.MjsTexture, name: str) -> Path:
+    """Path of an asset's file."""
     mesh = isinstance(element, mujoco.MjsMesh)
     folder = element.compiler.meshdir if mesh else element.compiler.texturedir
-    return Path(spec.modelfiledir, folder, element.file)
+    return Path(spec.modelfiledir, folder, name)
 
 
 def _readable(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
     """Whether MuJoCo can read a mesh's file, by its size, suffix and head."""
     if not mesh.file:
         return True
-    path = _file(spec, mesh)
+    path = _file(spec, mesh, mesh.file)
     if not os.path.isfile(path) or path.stat().st_size > MAX_MESH:
         return False
     if path.suffix.lower() != ".stl":
@@ -368,13 +369,13 @@ def _drawable(spec: mujoco.MjSpec, texture: mujoco.MjsTexture) -> bool:
     """Whether a texture's files exist, and it is small enough."""
     pixels = texture.width * texture.height
     for name in filter(None, (texture.file, *texture.cubefiles)):
-        path = _file(spec, texture).parent / Path(name).name
+        path = _file(spec, texture, name)
         if not os.path.isfile(path):
             return False
         with path.open("rb") as file:
             head = file.read(24)
         if head.startswith(b"\x89PNG"):
-            pixels = int.from_bytes(head[16:20]) * int.from_bytes(head[20:24])
+            pixels = max(pixels, int.from_bytes(head[16:20]) * int.from_bytes(head[20:24]))
     return pixels <= MAX_PIXELS
 
 

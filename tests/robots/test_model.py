@@ -5,6 +5,7 @@ import sys
 import time
 from pathlib import Path
 
+import imageio.v3 as imageio
 import mujoco
 import numpy as np
 import pytest
@@ -276,6 +277,24 @@ def test_pictures_that_are_missing_stop_nothing(tmp_path: Path) -> None:
     assert got.spec.compile().ntex == 0
     with pytest.raises(RobotError, match=r"mesh 'hull.stl', by which body 'trunk' is weighed"):
         drafted(tmp_path, text.replace('mesh="hull" mass="0"', 'mesh="hull"'), "model.xml")
+
+
+def test_a_texture_of_six_files_is_shown(tmp_path: Path) -> None:
+    """Each a PNG of its own, in the texture folder; one of too many points is left out."""
+    (tmp_path / "textures").mkdir()
+    sides = ("right", "left", "up", "down", "front", "back")
+    for name in sides:
+        imageio.imwrite(tmp_path / "textures" / f"{name}.png", np.zeros((4, 4, 3), np.uint8))
+    files = " ".join(f'file{name}="{name}.png"' for name in sides)
+    assets = f"""<compiler texturedir="textures"/><asset><texture name="skin" type="cube" {files}/>
+    <material name="skin" texture="skin"/></asset><worldbody>"""
+    text = walker().replace("<worldbody>", assets).replace('mass="5"', 'mass="5" material="skin"')
+    assert drafted(tmp_path, text, "model.xml", visual=True).spec.compile().ntex == 1
+    bomb = tmp_path / "textures" / "up.png"
+    head = bytearray(bomb.read_bytes())
+    head[16:24] = (100_000).to_bytes(4) * 2
+    bomb.write_bytes(head)
+    assert drafted(tmp_path, text, "model.xml", visual=True).spec.compile().ntex == 0
 
 
 @pytest.mark.parametrize(
