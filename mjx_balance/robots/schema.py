@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Gt, Le, Len, MinLen
 
 from mjx_balance.config import ConfigError
-from mjx_balance.files.text import MESSAGE, quote, shorten
+from mjx_balance.files.text import MESSAGE, printable, quote, shorten
 from mjx_balance.files.validation import STRICT, parse
 from mjx_balance.robots.robot import MOST, Number
 
@@ -143,8 +143,10 @@ def parse_robot_file(text: str, path: Path) -> RobotFile:
         legs = values.get("legs")
         if isinstance(legs, dict):
             values["legs"] = [_with(leg, name=name) for name, leg in legs.items()]
-        values = _with(values, name=path.stem, folder=str(path.absolute().parent))
+        values = _with(values, name=printable(path.stem), folder="")
         file = parse(RobotFile, values, remedies=REMEDIES)
+        # A path may hold bytes that are no UTF-8, which JSON does not.
+        file = dataclasses.replace(file, folder=path.absolute().parent)
         _check_joints(file)
     except RecursionError:
         raise RobotError(f"{path}: its values are nested too deep to be read") from None
