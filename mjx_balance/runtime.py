@@ -41,7 +41,7 @@ IMU = 6  #: gyro x, y and z, accelerometer x, y and z
 MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
 MOST_HEADER = 8 * 2**20  #: greatest size of its header
 MOST_MESSAGE, MOST_PATH, MOST_NAME = 300, 150, 100  #: greatest lengths of texts, characters
-MOST_LEGS, MOST_LAYERS, MOST_FACTORS = 16, 64, 8
+MOST_WEIGHTS, MOST_LEGS, MOST_LAYERS, MOST_FACTORS = 1_000, 16, 64, 8
 MOST_SAMPLES = 10_000  #: greatest number of samples per decision
 LEAST_SCALE = 1e-6  #: least scale of an input; it keeps inputs finite
 MOST_TURN = 16.0  #: greatest turn of a joint at angle 0, rad; two and a half turns are 15.7
@@ -513,9 +513,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         if size > len(content) - 8:
             raise ValueError("it ends within its header")
         if size > MOST_HEADER:
-            raise ValueError(f"its header has {size} bytes, more than {MOST_HEADER}")
+            raise PolicyFileError(f"its header has {size} bytes, more than {MOST_HEADER}")
         header, numbers = json.loads(content[8 : 8 + size]), memoryview(content)[8 + size :]
         metadata = header.pop("__metadata__", {})
+        if len(header) > MOST_WEIGHTS:
+            raise PolicyFileError(f"it has {len(header)} weights, more than {MOST_WEIGHTS}")
         ends = [entry["data_offsets"] for entry in header.values()]
         if sum(end - begin for begin, end in ends) != len(numbers):  # before anything is copied
             raise ValueError("its length is not that of its weights")

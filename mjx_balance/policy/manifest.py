@@ -6,6 +6,7 @@
 
 import contextlib
 import importlib.metadata
+import json
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -21,6 +22,7 @@ from mjx_balance.task.observation import input_rows
 
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 CONVERTIBLE = 4  #: older version that `upgrade` converts
+MOST_PART = 2**18  #: greatest size of config, robot, versions and training, characters
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts a file of version 4"
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 """Packages whose versions a manifest records."""
@@ -129,6 +131,10 @@ def upgrade(manifest: Any) -> Any:
 
 def _config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:
     """Checks all parts of a manifest of format 4 or 5 that do not follow from others."""
+    for name in ("config", "robot", "versions", "training"):
+        with contextlib.suppress(RecursionError):  # the checks of its fields find that
+            if len(json.dumps(manifest.get(name))) > MOST_PART:
+                raise PolicyError(f"its {name} has more than {MOST_PART} characters")
     for name, kind in (("scene_hash", str), ("versions", dict), ("training", dict)):
         parse(kind, manifest.get(name), PolicyError, name=name)
     with naming("its robot"):
