@@ -40,6 +40,7 @@ SENSORS = ("gyro", "accelerometer")
 IMU = 6  #: gyro x, y and z, accelerometer x, y and z
 MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
 MOST_HEADER = 8 * 2**20  #: greatest size of its header
+MOST_MANIFEST = 4 * 2**20  #: greatest size of its manifest, characters
 MOST_MESSAGE, MOST_PATH, MOST_NAME = 300, 150, 100  #: greatest lengths of texts, characters
 MOST_WEIGHTS, MOST_LEGS, MOST_LAYERS, MOST_FACTORS = 1_000, 16, 64, 8
 MOST_SAMPLES = 10_000  #: greatest number of samples per decision
@@ -515,7 +516,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         if size > MOST_HEADER:
             raise PolicyFileError(f"its header has {size} bytes, more than {MOST_HEADER}")
         header, numbers = json.loads(content[8 : 8 + size]), memoryview(content)[8 + size :]
-        metadata = header.pop("__metadata__", {})
+        text = header.pop("__metadata__", {}).get("manifest")
+        if isinstance(text, str) and len(text) > MOST_MANIFEST:
+            raise PolicyFileError(f"its manifest has {len(text)} characters, too many")
         if len(header) > MOST_WEIGHTS:
             raise PolicyFileError(f"it has {len(header)} weights, more than {MOST_WEIGHTS}")
         ends = [entry["data_offsets"] for entry in header.values()]
@@ -527,7 +530,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise PolicyFileError(f"it is damaged or no safetensors file: {error}") from error
     try:
-        manifest = json.loads(metadata["manifest"])
+        manifest = json.loads(text)
         kind, version = manifest["format"], manifest["version"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise PolicyFileError("it carries no manifest of a policy of mjx_balance") from error

@@ -201,6 +201,17 @@ def test_a_huge_header_is_refused_at_once(reader: str, entries: int, scratch: Pa
 
 
 @by_both
+def test_a_huge_manifest_is_refused_before_it_is_parsed(
+    reader: str, sound: bytes, scratch: Path
+) -> None:
+    """Of 1.7 million lists; its header is not yet too large. Found by fuzzing."""
+    text = json.dumps([[]] * 1_700_000, separators=(",", ":"))
+    metadata = {"manifest": text}
+    safetensors.numpy.save_file(safetensors.numpy.load(sound), scratch, metadata=metadata)
+    assert_refused(reader, scratch, "its manifest has 5100001 characters")
+
+
+@by_both
 def test_many_weights_beside_a_large_one_take_no_time(reader: str, scratch: Path) -> None:
     """Each is read once; a copy of 50 MiB for each takes half a minute."""
     weights = {f"w{k}": np.zeros(0, np.float32) for k in range(1_000)}
