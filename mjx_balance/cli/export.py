@@ -48,6 +48,6 @@ def _write_onnx(name: Path, out: Path) -> int:
 
 def _write_safetensors(name: Path, out: Path) -> int:
     policy = convert_policy(find_policy(name), out)
-    size, name = out.stat().st_size, shorten(out, PATH)
-    print(f"{name}: {size / 1000:,.1f} kB, format {FORMAT_VERSION}, weights {policy.fingerprint}")
+    size, file = out.stat().st_size, shorten(out, PATH)
+    print(f"{file}: {size / 1000:,.1f} kB, format {FORMAT_VERSION}, weights {policy.fingerprint}")
     return 0
