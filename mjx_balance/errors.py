@@ -1,5 +1,7 @@
 """Exit codes of the commands, and the base class of errors in the user's input."""
 
+from typing import ClassVar
+
 from mjx_balance.files.text import MESSAGE, shorten
 
 FAILED = 1
@@ -21,5 +23,7 @@ class InputError(ValueError):
     Values and names in it may come from strangers, so that it is shortened and printable.
     """
 
+    limit: ClassVar[int] = MESSAGE  #: greatest length of the message, characters
+
     def __init__(self, message: object = ""):
-        super().__init__(shorten(message, MESSAGE, tail=MESSAGE // 3))
+        super().__init__(shorten(message, self.limit, tail=self.limit // 3))

@@ -11,7 +11,7 @@ from mjx_balance.config import check, preset
 from mjx_balance.errors import USAGE_ERROR, InputError
 from mjx_balance.evaluation import rollout
 from mjx_balance.evaluation.controllers import Controller, ControllerError, make_controller
-from mjx_balance.files.text import MESSAGE, shorten
+from mjx_balance.files.text import PATH, shorten
 from mjx_balance.policy.file import load_policy
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import Scene, load_scene
@@ -21,7 +21,7 @@ HELP = ("-h", "--help")
 
 def complain(message: str, code: int = USAGE_ERROR) -> int:
     """Prints an error message; returns the exit code."""
-    print(f"mjx-balance: {shorten(message, MESSAGE, tail=MESSAGE // 3)}", file=sys.stderr)
+    print(f"mjx-balance: {shorten(message, PATH)}", file=sys.stderr)
     return code
 
 

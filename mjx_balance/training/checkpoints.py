@@ -19,7 +19,7 @@ from typing import Any, TypeVar, cast
 import orbax.checkpoint as ocp
 
 from mjx_balance.errors import InputError
-from mjx_balance.files.text import MESSAGE, shorten
+from mjx_balance.files.text import MESSAGE, PATH, shorten
 from mjx_balance.training.processes import ALONE, Processes
 
 T = TypeVar("T")
@@ -34,6 +34,8 @@ class CheckpointError(InputError):
 
 class SaveError(CheckpointError):
     """A checkpoint, or another file of a run, that cannot be written; the message says why."""
+
+    limit = PATH  # it ends in a command with the user's own path, to be copied
 
 
 def save(directory: Path, env_steps: int, state: object, processes: Processes = ALONE) -> None:

@@ -572,7 +572,7 @@ def test_what_a_policy_names_is_not_opened(
         lambda: evaluate(policy, "paper", 1, 1.0, 0),
         lambda: ControllerArgs(policy=tmp_path / "p").load(),
     ):
-        with pytest.raises(PolicyError, match=f"robot is {re.escape(repr(name))}{sentence}"):
+        with pytest.raises(PolicyError, match=f"robot is {re.escape(repr(name)[:60])}.*{sentence}"):
             attempt()
     assert not (tmp_path / "imported").exists()
     assert not set(modules) & set(sys.modules)
