@@ -22,7 +22,7 @@ else:
 
 READ_AT_MOST = 2**20  #: greatest size of a JSON file of a run, bytes; usual ones have some kB
 LONGEST_LINE = 2**22  #: of metrics.jsonl, bytes; thousands of seeds fit
-PATH = 150  #: greatest length of a path in the message of `check_contained`, characters
+PATH = 150  #: greatest length of a path in the middle of a message, characters
 PART = ".mjx_balance-{}.part"  #: name of a file or folder that is not complete yet
 
 
@@ -129,13 +129,16 @@ def create_run_folder(
         part.rename(path)
     except OSError as error:
         shutil.rmtree(part, ignore_errors=True)
-        if error.errno in (errno.EEXIST, errno.ENOTEMPTY):  # perhaps only since a moment
+        if os.path.lexists(path) and error.errno in (errno.EEXIST, errno.ENOTEMPTY):
             raise RunFolderExistsError(
                 f"run folder {path} exists; choose another with --run-dir, or continue it with "
                 f"--resume {shell(path)}"
             ) from error
+        reason = error.strerror
+        if error.errno == errno.EEXIST:
+            reason = f"{shorten(error.filename, PATH)} is a link to what does not exist"
         raise RunFolderError(
-            f"run folder {path} cannot be written: {error.strerror}; choose another with --run-dir"
+            f"run folder {path} cannot be written: {reason}; choose another with --run-dir"
         ) from error
     return RunFolder(path)
 

@@ -171,6 +171,21 @@ def test_an_existing_folder_and_an_unwritable_one_are_refused(tmp_path: Path) ->
     assert sorted(os.listdir(tmp_path)) == ["file", "mine"]
 
 
+def test_a_parent_that_is_a_link_to_nothing_is_no_run(tmp_path: Path) -> None:
+    """Another name in it would be no better, so that `train` must not try the next one."""
+    (tmp_path / "runs").symlink_to(tmp_path / "gone")
+    (tmp_path / "circle").symlink_to("circle")
+    for place, reason in (
+        ("runs/a", "runs is a link to what does not exist"),
+        ("runs/b/a", "runs is a link to what does not exist"),
+        ("circle/a", "Too many levels of symbolic links"),
+    ):
+        with pytest.raises(RunFolderError, match=f"{place} cannot be.*{reason}") as error:
+            create_run_folder(tmp_path / place, to_dict(CONFIG), TODAY)
+        assert type(error.value) is RunFolderError
+    assert sorted(os.listdir(tmp_path)) == ["circle", "runs"]
+
+
 def test_one_process_at_a_time_works_on_a_run(folder: RunFolder) -> None:
     """The lock of a killed process and of one that is done is free."""
     hold = (
