@@ -24,6 +24,7 @@ CALF_RADII = 8  #: least length of a calf, in radii of its foot
 MIN_REACH = 0.85
 """Least distance of a foot from the knee, as a share of the calf's length; a sphere or site that
 is nearer is no foot."""
+SIZES = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  #: positions of a joint
 NAMELESS, MISSING = "?", ('["ABDUCTION", "HIP", "KNEE"]', '"FOOT"')
 GIVE = "give it one in its model, for the file to use"
 CORNERS = {"FL": "front left", "FR": "front right", "RL": "rear left", "RR": "rear right"}
@@ -84,6 +85,9 @@ def sketch(model: str, path: Path, strip: Sequence[str] = ()) -> tuple[str, list
 
 def _sketch(model: str, path: Path, strip: Sequence[str]) -> tuple[str, list[str]]:
     spec = read_model(path).spec
+    places = _places(spec)
+    for key in list(spec.keys):  # they have no place for other joints
+        spec.delete(key)
     strip_elements(spec, strip)
     problems = []
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints):
@@ -97,17 +101,39 @@ def _sketch(model: str, path: Path, strip: Sequence[str]) -> tuple[str, list[str
         for joint in root.joints:
             spec.delete(joint)
         root.add_freejoint()
-        for key in list(spec.keys):  # they have no place for it
-            spec.delete(key)
     compiled = compile_model(spec, path.name)
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
     free = compiled.jnt_bodyid[compiled.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
     trunk = int(free[np.argmax(compiled.body_subtreemass[free])])
     legs = _legs(compiled, data, trunk, path, problems)
-    text = _render(compiled, data, model, trunk, legs, strip, problems)
+    text = _render(compiled, data, model, trunk, legs, strip, places, problems)
     mend = "".join(f"# To mend: {problem}.\n" for problem in problems)
     return HEADER + mend + text, problems
+
+
+def _places(spec: mujoco.MjSpec) -> dict[str, float]:
+    """Positions of hinges and slides, by name, in keyframe `home`, or the first; rad or m."""
+    keys = list(spec.keys)
+    if not keys:
+        return {}
+    qpos = list(next((key for key in keys if key.name == "home"), keys[0]).qpos)
+    places, start = {}, 0
+    for joint in _depth_first(spec.worldbody):
+        size = SIZES.get(joint.type, 1)
+        if size == 1:
+            places[joint.name] = start
+        start += size
+    if start != len(qpos):  # a keyframe need not say any
+        return {}
+    return {name: qpos[at] for name, at in places.items()}
+
+
+def _depth_first(body: mujoco.MjsBody) -> Iterator[mujoco.MjsJoint]:
+    """Joints of a body and of those below it, in the order of a compiled model."""
+    yield from body.joints
+    for child in body.bodies:
+        yield from _depth_first(child)
 
 
 def _size(body: mujoco.MjsBody) -> int:
@@ -274,14 +300,11 @@ def _corners(
     return corners, forward == 1
 
 
-def _fixed(model: mujoco.MjModel, joint: int) -> str:
-    """Entry of `strip` that fixes a joint where keyframe `home`, or the first, has it."""
-    name, place = _toml(model.joint(joint).name), model.jnt_qposadr[joint]
-    if not model.nkey or model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
-        return name
-    names = [model.key(k).name for k in range(model.nkey)]
-    at = model.key_qpos[names.index("home") if "home" in names else 0, place]
-    return name if at == model.qpos0[place] else f"{{ joint = {name}, at = {at:.6g} }}"
+def _fixed(model: mujoco.MjModel, joint: int, places: dict[str, float]) -> str:
+    """Entry of `strip` that fixes a joint at its place of `_places`."""
+    name, zero = model.joint(joint).name, model.qpos0[model.jnt_qposadr[joint]]
+    at = places.get(name, zero)
+    return _toml(name) if at == zero else f"{{ joint = {_toml(name)}, at = {at:.6g} }}"
 
 
 def _render(
@@ -291,6 +314,7 @@ def _render(
     trunk: int,
     legs: list[_Leg],
     strip: Sequence[str],
+    places: dict[str, float],
     problems: list[str],
 ) -> str:
     corners, turned = _corners(model, data, trunk, legs, problems)
@@ -305,7 +329,7 @@ def _render(
     lines += [f"imu = {_toml(imu)}" for imu in imus if "imu" in imu.lower()][:1]
     used = {joint for leg in legs for joint in leg.joints}
     hinges = np.flatnonzero(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
-    fixed = [_fixed(model, int(k)) for k in hinges if k not in used]
+    fixed = [_fixed(model, int(k), places) for k in hinges if k not in used]
     if fixed or strip:
         entries = ", ".join((*map(_toml, strip), *fixed))
         line = f"strip = [{entries}]  # fixed; a body's name instead leaves it out"

@@ -525,6 +525,29 @@ def test_a_draft_fixes_joints_where_the_keyframe_has_them(tmp_path: Path) -> Non
     assert 'strip = [{ joint = "lift", at = 0 }, { joint = "shoulder", at = 0 }]' in drafted
 
 
+@pytest.mark.parametrize("strip", ["lift", "arm", "shoulder", "eye"])
+def test_a_draft_strips_a_model_with_a_keyframe(strip: str, tmp_path: Path) -> None:
+    """Whatever it strips, what is left is fixed where the keyframe of the whole has it."""
+    eye = '<body name="eye"><joint name="eye" type="ball"/><geom size=".02" mass=".1"/></body>'
+    model = walker(more=f"{eye}{ARM}")
+    (tmp_path / "model.xml").write_text(model)
+    whole = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    qpos = whole.qpos0.copy()
+    at = {"lift": 0.25, "shoulder": -1.25}
+    for name, value in at.items():
+        qpos[whole.joint(name).qposadr] = value
+    numbers = " ".join(map(str, qpos))
+    key = f'<keyframe><key name="home" qpos="{numbers}"/></keyframe>'
+    (tmp_path / "model.xml").write_text(model.replace("</mujoco>", f"{key}</mujoco>"))
+    text, problems = sketch("model.xml", tmp_path / "model.xml", [strip])
+    assert problems == []
+    gone = {"lift": ("lift", "arm", "shoulder"), "arm": ("arm", "shoulder")}.get(strip, (strip,))
+    for name, value in at.items():
+        assert (f'{{ joint = "{name}", at = {value} }}' in text) == (name not in gone)
+    assert (', "eye"' in text) == (strip != "eye")
+    build(parse_robot_file(text, tmp_path / "drafted.toml"))
+
+
 def test_a_ball_is_fixed_nowhere_else(tmp_path: Path) -> None:
     ball = '<body name="eye"><joint name="eye" type="ball"/><geom size=".02" mass=".1"/></body>'
     (tmp_path / "model.xml").write_text(walker(more=ball))
