@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mjx_balance.errors import InputError
+from mjx_balance.files import text
 from mjx_balance.files.text import MESSAGE, shell, shorten
 
 if sys.platform == "win32":
@@ -32,6 +33,8 @@ class RunFolderError(InputError):
 
 class RunFolderExistsError(RunFolderError):
     """The folder of a new run exists."""
+
+    limit = text.PATH  # it ends in a command with the user's own path, to be copied
 
 
 class RunFolder:
@@ -119,7 +122,7 @@ def create_run_folder(
     Raises:
       RunFolderError: if the folder exists or cannot be written; nothing changes then.
     """
-    part = path.with_name(PART.format(secrets.token_hex(8)))
+    part = path.parent / PART.format(secrets.token_hex(8))
     try:
         if path.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
@@ -175,6 +178,8 @@ def check_contained(path: Path) -> RunFolder:
                     f"{shorten(entry, PATH)} is neither a file nor a folder; remove it"
                 )
         except OSError as error:
+            if isinstance(error, FileNotFoundError) and not os.path.lexists(entry):
+                continue  # a run that goes on has renamed it
             raise RunFolderError(
                 f"{shorten(entry, PATH)} cannot be read: {error.strerror}"
             ) from error

@@ -171,6 +171,23 @@ def test_an_existing_folder_and_an_unwritable_one_are_refused(tmp_path: Path) ->
     assert sorted(os.listdir(tmp_path)) == ["file", "mine"]
 
 
+def test_the_folder_that_one_is_in_exists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such paths end in no name: `.` and `/`, and the empty one of a shell variable not set."""
+    monkeypatch.chdir(tmp_path)
+    for path in (Path(), Path("/"), Path("..")):
+        with pytest.raises(RunFolderExistsError, match=r"run folder \S+ exists; choose another"):
+            create_run_folder(path, to_dict(CONFIG), TODAY)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_that_continues_a_run_is_whole_however_long_its_path(tmp_path: Path) -> None:
+    deep = tmp_path.joinpath(*["d" * 150] * 5, "my run")
+    deep.mkdir(parents=True)
+    with pytest.raises(RunFolderExistsError) as error:
+        create_run_folder(deep, to_dict(CONFIG), TODAY)
+    assert str(error.value).endswith(f"continue it with --resume '{deep}'")
+
+
 def test_a_parent_that_is_a_link_to_nothing_is_no_run(tmp_path: Path) -> None:
     """Another name in it would be no better, so that `train` must not try the next one."""
     (tmp_path / "runs").symlink_to(tmp_path / "gone")
@@ -367,6 +384,30 @@ def test_links_within_the_folder_and_to_it_are_followed(folder: RunFolder, tmp_p
     assert read_run_config(tmp_path / "latest") == CONFIG
     (folder.path / "elsewhere" / "out").symlink_to("/etc")
     with pytest.raises(RunFolderError, match="validated/out is a link that leads out"):
+        read_run_config(folder.path)
+
+
+@pytest.mark.parametrize("call", ["lstat", "scandir"])
+def test_what_a_run_renames_while_it_is_looked_at_is_no_error(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    """A checkpoint has its name once it is whole: `report` on a run that goes on may see it go."""
+    part, whole = folder.checkpoints / ".mjx_balance-1.part", folder.checkpoints / "1024"
+    part.mkdir(parents=True)
+    (part / "state").touch()
+    original = getattr(os, call)
+
+    def look(path: str) -> Any:
+        if str(path) == str(part) and part.exists():
+            part.rename(whole)
+        return original(path)
+
+    monkeypatch.setattr(os, call, look)
+    assert read_run_config(folder.path) == CONFIG
+    assert whole.exists()
+    monkeypatch.undo()
+    (whole / "link").symlink_to("nothing")
+    with pytest.raises(RunFolderError, match=r"1024/link cannot be read: No such file"):
         read_run_config(folder.path)
 
 
