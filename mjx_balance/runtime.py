@@ -27,6 +27,7 @@ import json
 import math
 import os
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,8 @@ KNEE_SLACK = 0.1  #: tolerance of a knee's reading beyond its stops, rad
 STUCK_MOST = 0.1  #: greatest motion of a target while its joint's reading stays the same, rad
 RECENT = (10, 50)  #: bounds of the number of IMU samples that are checked for repetitions
 LIVELY = 1 / 3  #: least share of different ones; there the mean tilt is a fifth greater
-LIVELY_SENSOR = 1 / 5  #: least share of new values of gyro or accelerometer; a quiet gyro has few
+LIVELY_SENSOR = 1 / 5  #: least share of new values of gyro or accelerometer, of a robot that moves
+MOVED_LEAST = 0.003  #: motion of a joint that every gyro notices, rad; one still has few values
 LATE_SAMPLES = 5  #: greatest gap between calls, and error of a decision's length
 
 
@@ -138,6 +140,8 @@ class Controller:
         self._inputs = inputs = _Inputs(manifest["inputs"], len(self.joints))
         self._recent = min(max(self.decision_samples, RECENT[0]), RECENT[1])
         self._history = max(inputs.lookback("gyro", "accelerometer"), self._recent)
+        # Joints at the decisions of the time that is checked for repetitions.
+        self._poses: deque[np.ndarray] = deque(maxlen=-(-self._recent // self.decision_samples))
         # The history up to the last decision, then the samples since.
         self._imu = np.empty((self._history + self.decision_samples, IMU))
         self._commands = np.empty((inputs.lookback("command"), len(self.joints)))
@@ -226,7 +230,9 @@ class Controller:
         self._seen += 1
         if self.state is State.STANDING:
             self._imu[:] = self._reading[-IMU:]
-            self._joints, self._there = self._reading[:-IMU].copy(), self._targets.ravel()
+            self._poses.clear()
+            self._poses.append(self._reading[:-IMU].copy())
+            self._there = self._targets.ravel()
             self._check_posture()
             self.state = State.BALANCING
             self._decide(now)
@@ -277,26 +283,31 @@ class Controller:
 
     def _check_liveness(self) -> None:
         """Checks that the IMU's samples differ, and that joints move if their targets do."""
-        recent, count = self._imu[-self._recent :], self._recent
-        new = [len(set(map(bytes, recent)))]
-        changed = (recent[1:] != recent[:-1]).reshape(-1, 2, 3).any(axis=2)
-        new += (1 + changed.sum(axis=0)).tolist()
-        for name, value, share in zip(("IMU", *SENSORS), new, (LIVELY, *2 * (LIVELY_SENSOR,))):
-            least = max(2, round(share * count))
-            if value < least and self._seen >= count:
-                raise _Unsafe(
-                    f"the {name} repeats itself: {value} of its last {count} samples are new; at "
-                    f"least {least} must be"
-                )
+        recent = self._imu[-self._recent :]
+        self._check_new("IMU", len(set(map(bytes, recent))), len(recent), LIVELY)
         joints, targets = self._reading[:-IMU], self._targets.ravel()
-        self._there = np.where(joints != self._joints, targets, self._there)
-        self._joints = joints.copy()
+        if np.abs(joints - self._poses[0]).max() > MOVED_LEAST:
+            since = self._imu[-max(self._recent, self.decision_samples) :]
+            changed = (since[1:] != since[:-1]).reshape(-1, 2, 3).any(axis=2)
+            for name, new in zip(SENSORS, (1 + changed.sum(axis=0)).tolist()):
+                self._check_new(name, new, len(since), LIVELY_SENSOR)
+        self._there = np.where(joints != self._poses[-1], targets, self._there)
+        self._poses.append(joints.copy())
         moved = np.abs(targets - self._there)
         if moved.max() > STUCK_MOST:
             k = int(moved.argmax())
             raise _Unsafe(
                 f"{self._name(k)} reads {joints[k]:.3g} all the time, while its target moved by "
                 f"{moved[k]:.2g} rad"
+            )
+
+    def _check_new(self, name: str, new: int, count: int, share: float) -> None:
+        """Checks that enough of a sensor's last `count` samples are new."""
+        least = max(2, round(share * self._recent))
+        if new < least and self._seen >= count:
+            raise _Unsafe(
+                f"the {name} repeats itself: {new} of its last {count} samples are new; at least "
+                f"{least} must be"
             )
 
     def _check_posture(self) -> None:

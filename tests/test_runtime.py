@@ -429,6 +429,37 @@ def test_some_repeated_samples_are_no_dead_imu(
     assert rig.controller.state is State.BALANCING
 
 
+@pytest.mark.parametrize("bias", [0.0, 0.0001])
+def test_a_coarse_gyro_of_a_robot_that_is_still_is_not_dead(rig: Rig, bias: float) -> None:
+    """Of 2,000 deg/s in 16 bits, with noise of a fifth of a step: few of its samples are new."""
+    step, new, last = math.radians(2000 / 2**15), [], None
+    for k in range(501):
+        gyro = np.round(rig.rng.normal(bias, step / 5, 3) / step) * step
+        if k % 50 == 1:
+            new.append(0)
+        if k:
+            new[-1] += not np.array_equal(gyro, last)
+        last = gyro
+        rig.step(gyro=gyro, accel=rig.rng.normal((0, 0, 9.81), 0.02))
+    assert min(new) < 10
+    assert rig.controller.state is State.BALANCING, rig.controller.reason
+    fed(rig, 101, lambda k: {"gyro": last})  # it moves: the accelerometer leans
+    assert rig.controller.reason.startswith("the gyro repeats itself: ")
+
+
+@pytest.mark.parametrize("samples", [10, 25, 50, 100])
+def test_a_dead_gyro_makes_it_hold_whatever_a_decision_lasts(
+    tmp_path: Path, config: Config, samples: int
+) -> None:
+    """Joints that move 0.02 rad in 50 samples, at the beginning of each decision."""
+    random_policy(tmp_path / "p", with_head(config, "radial", ctrl_dt=samples * 0.004))
+    rig = Rig(tmp_path / "p")
+    for k in range(401):
+        pose = np.full((4, 3), 0.02 * (k // samples) * samples / 50 % 0.1)
+        rig.step(joints=rig.standing + pose, gyro=[0.01, 0, 0])
+    assert rig.controller.reason.startswith("the gyro repeats itself: 1 of its last ")
+
+
 @pytest.mark.parametrize("rate", [10, 25, 50])
 def test_it_holds_long_before_a_slow_imu_lets_the_robot_fall(rate: int) -> None:
     """On the board whose corners sink: with samples of 10 Hz it would lean by 7 deg."""
