@@ -44,6 +44,8 @@ FLAGS = (
     *("jax_default_prng_impl", "jax_threefry_partitionable", "jax_enable_custom_prng"),
 )
 """Settings of JAX that change what a trace gives."""
+TRACED, COMPILED = "traced", "compiled"
+"""Folders of the cache. Version 0.3 had others, `programs` and `xla`, which a group could write."""
 XLA_DAMAGED = "Error reading persistent compilation cache entry for '"
 
 LogFn: TypeAlias = Callable[[str], None]  #: takes one line for the user
@@ -80,7 +82,10 @@ def _check_ours(folder: Path) -> None:
     """Makes a folder private; raises `OSError` if others may have written to it until now."""
     mode = folder.stat().st_mode
     for path in (folder, *folder.iterdir()):
-        status = path.stat() if path == folder else path.lstat()
+        try:
+            status = path.stat() if path == folder else path.lstat()
+        except FileNotFoundError:  # another run has renamed what it wrote
+            continue
         if status.st_uid != os.geteuid():
             raise OSError(errno.EACCES, "it is another user's", str(path))
         if mode & 0o077 and status.st_mode & 0o022 and not path.is_symlink():
@@ -92,7 +97,7 @@ def _check_ours(folder: Path) -> None:
 def enable_compilation_cache(log_fn: LogFn) -> None:
     """Turns XLA's persistent cache on for every program; call before compiling."""
     try:
-        _, folder = cache_dir("programs"), cache_dir("xla")
+        _, folder = cache_dir(TRACED), cache_dir(COMPILED)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
@@ -115,9 +120,9 @@ def mending_xla_cache(log_fn: LogFn) -> Iterator[None]:
             warnings.warn_explicit(warning.message, *origin)
             continue
         module = rest.partition("'")[0]
-        for entry in (cache_dir() / "xla").glob(f"{module}-*-cache"):
+        for entry in (cache_dir() / COMPILED).glob(f"{module}-*-cache"):
             entry.unlink(missing_ok=True)
-        log_fn(f"compiled anew: what {cache_dir() / 'xla'} had of {module} was damaged")
+        log_fn(f"compiled anew: what {cache_dir() / COMPILED} had of {module} was damaged")
 
 
 def versions() -> dict[str, str | None]:
@@ -201,7 +206,7 @@ def compile_program(
 def _file(key: str) -> Path | None:
     """Of a program; None without a cache, as `enable_compilation_cache` has said."""
     with contextlib.suppress(OSError):
-        return cache_dir("programs") / f"{key}.stablehlo"
+        return cache_dir(TRACED) / f"{key}.stablehlo"
     return None
 
 

@@ -67,11 +67,11 @@ def test_a_second_start_traces_nothing_but_programs_without_a_key(cache: Path) -
     for counter in (Counter(), Counter()):
         check_run(compile_program(counter.program, start(), None, pytest.fail))
         assert counter.traced == 1
-    assert not (cache / "programs").exists()
+    assert not (cache / "traced").exists()
     first, second = Counter(), Counter()
     check_run(compile_program(first.program, start(), "key", pytest.fail))
     assert first.traced == 1
-    files = list((cache / "programs").iterdir())
+    files = list((cache / "traced").iterdir())
     assert [file.name for file in files] == ["key.stablehlo"]
     check_run(compile_program(second.program, start(), "key", pytest.fail))
     assert second.traced == 0
@@ -92,7 +92,7 @@ def test_a_damaged_program_is_logged_and_replaced(
     cache: Path, damage: Callable[[bytes], bytes]
 ) -> None:
     compile_program(Counter().program, start(), "key", pytest.fail)
-    file = cache / "programs" / "key.stablehlo"
+    file = cache / "traced" / "key.stablehlo"
     whole = file.read_bytes()
     file.write_bytes(damage(whole))
     lines: list[str] = []
@@ -109,13 +109,13 @@ def test_a_run_works_without_a_cache_that_it_cannot_write(cache: Path) -> None:
     lines: list[str] = []
     check_run(compile_program(Counter().program, start(), "key", lines.append))
     program_cache.enable_compilation_cache(lines.append)
-    assert lines == [f"nothing is cached, {cache / 'programs'} cannot be used: Not a directory"]
+    assert lines == [f"nothing is cached, {cache / 'traced'} cannot be used: Not a directory"]
     assert cache.read_text() == "no folder"
 
 
 def plant(cache: Path, planter: str) -> Path:
     """A program that is not ours to run, in a cache as another user could have made it."""
-    folder = cache / "programs"
+    folder = cache / "traced"
     folder.mkdir(parents=True, mode=0o755)
     doubled = jax.jit(lambda leaves: ([leaves[0] + 100, *leaves[1:]], {"sum": leaves[0]}))
     program = bytes(jax.export.export(doubled)(jax.tree.leaves(start())).serialize())
@@ -157,7 +157,7 @@ def test_a_program_that_another_user_may_have_planted_never_runs(
 
 def test_a_cache_is_for_its_user_alone(cache: Path) -> None:
     """Whatever the umask; an older one, which others could read, is closed."""
-    folder = cache / "programs"
+    folder = cache / "traced"
     folder.mkdir(parents=True, mode=0o755)
     before = os.umask(0o002)
     try:
@@ -170,10 +170,34 @@ def test_a_cache_is_for_its_user_alone(cache: Path) -> None:
     assert folder.stat().st_mode & 0o777 == 0o700
 
 
+def test_a_cache_of_version_0_3_is_in_nobodys_way(cache: Path, xla_settings: None) -> None:
+    """Its group could write to it, where the umask is 002: it is neither used nor complained of."""
+    for name in ("programs/key.stablehlo", "xla/jit_f-0-cache"):
+        file = cache / name
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"old")
+        file.chmod(0o664)
+        file.parent.chmod(0o775)
+    program_cache.enable_compilation_cache(pytest.fail)
+    for traced in (1, 0):
+        counter = Counter()
+        check_run(compile_program(counter.program, start(), "key", pytest.fail))
+        assert counter.traced == traced
+    assert (cache / "programs" / "key.stablehlo").read_bytes() == b"old"
+
+
+def test_a_file_that_another_run_renames_now_is_no_error(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = program_cache.cache_dir("traced")
+    monkeypatch.setattr(Path, "iterdir", lambda folder: iter([folder / ".mjx_balance-1.part"]))
+    assert program_cache.cache_dir("traced") == folder
+
+
 @pytest.mark.parametrize("content", [b"", b"no flatbuffer", bytes(1000), b"\xff" * 1000])
 def test_what_is_no_program_is_a_miss(cache: Path, content: bytes) -> None:
     """Though its digest is right."""
-    folder, lines, counter = program_cache.cache_dir("programs"), [], Counter()
+    folder, lines, counter = program_cache.cache_dir("traced"), [], Counter()
     (folder / "key.stablehlo").write_bytes(hashlib.sha256(content).digest() + content)
     check_run(compile_program(counter.program, start(), "key", lines.append))
     assert counter.traced == 1
@@ -196,18 +220,24 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.fixture
-def xla_cache(cache: Path) -> Iterator[Path]:
-    """XLA's own cache, turned on as a run does."""
+def xla_settings() -> Iterator[None]:
+    """For a test that turns XLA's cache on: it is off again after it."""
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
     before = {name: getattr(jax.config, name) for name in names}
     compilation_cache.reset_cache()
-    program_cache.enable_compilation_cache(pytest.fail)
-    assert jax.config.jax_persistent_cache_min_compile_time_secs == 0.5
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    yield cache / "xla"
+    yield
     for name, value in before.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
+
+
+@pytest.fixture
+def xla_cache(cache: Path, xla_settings: None) -> Path:
+    """XLA's own cache, turned on as a run does."""
+    program_cache.enable_compilation_cache(pytest.fail)
+    assert jax.config.jax_persistent_cache_min_compile_time_secs == 0.5
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    return cache / "compiled"
 
 
 def test_what_xla_finds_damaged_is_logged_and_removed(xla_cache: Path) -> None:
