@@ -51,13 +51,21 @@ def build(file: RobotFile, visual: bool = False) -> Build:
 
 
 def _build(file: RobotFile, visual: bool) -> Build:
-    spec, couplings, notes = read_model(model_path(file.model, file.folder), visual)
+    def strip_early(spec: mujoco.MjSpec) -> None:
+        if spec.compiler.settotalmass <= 0:
+            _strip_file(spec, file)
+
+    path = model_path(file.model, file.folder)
+    spec, couplings, notes = read_model(path, visual, strip_early)
+    shares = spec.compiler.settotalmass > 0  # a body's mass is a share of the whole model's
     trunk = _find(spec.bodies[1:], file.trunk, "trunk", "bodies")
     free = [j for j in trunk.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         raise RobotError(f"trunk {quote(file.trunk)} has no free joint; {_remedy(trunk)}")
     notes += _keep_inertia(spec, trunk)
-    _strip(spec, trunk, file)
+    if shares:
+        _strip_file(spec, file)
+    _leave_robot(spec, trunk)
     notes += _left_out(spec, couplings, file)
     masses = _masses(compile_model(spec)) if notes else ""
     feet = {leg.name: _foot(spec, leg) for leg in file.legs}
@@ -102,11 +110,8 @@ def _find(elements: list, name: str, what: str, kind: str):
     raise RobotError(f"{what} is {quote(name)}, which its model does not have; its {kind}: {names}")
 
 
-def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
-    """Removes what the file strips, and everything but the robot's bodies, joints and geoms."""
-    for key in list(spec.keys):
-        spec.delete(key)
-    _strip_file(spec, file)
+def _leave_robot(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
+    """Removes everything but the robot's bodies, joints and geoms."""
     for actuator in list(spec.actuators):
         if actuator.trntype not in JOINT_ACTUATORS or spec.joint(actuator.target) is None:
             spec.delete(actuator)
@@ -117,7 +122,7 @@ def _strip(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, file: RobotFile) -> None:
 
 
 def strip_elements(spec: mujoco.MjSpec, strip: Iterable[str | FixedJoint], trunk: str = "") -> None:
-    """Removes bodies and joints with all that refers to them.
+    """Removes bodies and joints with all that refers to them, and all keyframes.
 
     Args:
       spec: the model.
@@ -132,6 +137,8 @@ def strip_elements(spec: mujoco.MjSpec, strip: Iterable[str | FixedJoint], trunk
         free = [x for x in spec.joints if x.type == mujoco.mjtJoint.mjJNT_FREE]
         return [x.name for x in free if trunk in ("", x.parent.name)]
 
+    for key in list(spec.keys):  # they have no place for other joints
+        spec.delete(key)
     names = {element.name for element in (*spec.joints, *spec.bodies)}
     fixed = not free_joints()
     for entry in strip:

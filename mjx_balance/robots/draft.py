@@ -84,11 +84,13 @@ def sketch(model: str, path: Path, strip: Sequence[str] = ()) -> tuple[str, list
 
 
 def _sketch(model: str, path: Path, strip: Sequence[str]) -> tuple[str, list[str]]:
-    spec = read_model(path).spec
-    places = _places(spec)
-    for key in list(spec.keys):  # they have no place for other joints
-        spec.delete(key)
-    strip_elements(spec, strip)
+    places: dict[str, float] = {}
+
+    def take_out(spec: mujoco.MjSpec) -> None:
+        places.update(_places(spec))
+        strip_elements(spec, strip)
+
+    spec = read_model(path, strip=take_out).spec
     problems = []
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints):
         root = max(spec.worldbody.bodies, key=_size, default=None)

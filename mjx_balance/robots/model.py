@@ -6,7 +6,7 @@ import importlib.util
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -125,7 +125,9 @@ def _menagerie(name: str) -> Path:
         raise RobotError(f"robot menagerie:{name} cannot be had: {error}") from error
 
 
-def read_model(path: Path, visual: bool = False) -> Model:
+def read_model(
+    path: Path, visual: bool = False, strip: Callable[[mujoco.MjSpec], None] = lambda _: None
+) -> Model:
     """Reads a model file; no static body is fused.
 
     The root of a URDF gets a free joint if it has no joint. Links without `<inertial>` weigh
@@ -134,16 +136,17 @@ def read_model(path: Path, visual: bool = False) -> Model:
     Args:
       path: MJCF or URDF.
       visual: whether a URDF's visual shapes are read.
+      strip: takes out of the model what is not needed, before that is mended or refused.
 
     Raises:
       RobotError: if it is too large, unreadable, or a link cannot have the inertia that it has.
     """
     _check_text(path)
     with naming(f"{path.name} cannot be read"):
-        return _read(path, visual)
+        return _read(path, visual, strip)
 
 
-def _read(path: Path, visual: bool) -> Model:
+def _read(path: Path, visual: bool, strip: Callable[[mujoco.MjSpec], None]) -> Model:
     is_urdf = path.suffix.lower() in (".urdf", ".xacro")
     if is_urdf:
         spec = mujoco.MjSpec.from_string(urdf.read(path, visual))
@@ -154,12 +157,11 @@ def _read(path: Path, visual: bool) -> Model:
     _check_elements(spec, path)
     couplings = tuple(_couplings(spec))
     _clean(spec)
-    notes: list[str] = []
-    if is_urdf:
-        for root in spec.worldbody.bodies:
-            if not root.joints:
-                root.add_freejoint()
-        notes += _weigh_links(spec)
+    for root in spec.worldbody.bodies if is_urdf else ():
+        if not root.joints:
+            root.add_freejoint()
+    strip(spec)
+    notes = _weigh_links(spec) if is_urdf else []
     notes += [*_mend_inertias(spec), *_dense(spec), *_drop_unreadable(spec)]
     return Model(spec, couplings, notes)
 

@@ -377,6 +377,59 @@ def test_a_link_that_moves_is_mended_if_it_misses_by_little(
             drafted(tmp_path, text)
 
 
+def hinged(name: str, parent: str, content: str) -> tuple[str, str]:
+    """An edit that hangs a link on another one by a joint without limits, `to_NAME`."""
+    edit = fixed(name, parent, content)[1].replace('"fixed"', '"continuous"')
+    return "</robot>", edit
+
+
+REFUSED: dict[str, tuple[str, list[str], str]] = {
+    "a lidar without a mass": (urdf([hinged("lidar", "trunk", BOX)]), ["lidar"], "'lidar' moves"),
+    "its joint": (urdf([hinged("lidar", "trunk", BOX)]), ["to_lidar"], "'lidar' moves"),
+    "an impossible arm": (
+        urdf([hinged("arm", "trunk", inertial(0.5, 1e-3, 1e-3, 9e-3))]),
+        ["arm"],
+        "'arm' of 0.5 kg has",
+    ),
+    "an arm that is not finite": (
+        urdf([hinged("arm", "trunk", inertial(0.5, 1e-3, np.inf, 1e-3))]),
+        ["arm"],
+        "'arm'|'to_arm'|not finite",
+    ),
+    "a mesh that is lost": (
+        walker(more='<body name="arm"><geom type="mesh" mesh="a"/></body>').replace(
+            "<worldbody>", '<asset><mesh name="a" file="gone.stl"/></asset><worldbody>'
+        ),
+        ["arm"],
+        "mesh 'gone.stl', by which body 'arm'",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_what_is_stripped_need_not_be_right(kind: str, tmp_path: Path) -> None:
+    text, strip, message = REFUSED[kind]
+    path = tmp_path / ("model.xml" if "<mujoco>" in text else "model.urdf")
+    path.write_text(text)
+    with pytest.raises(RobotError, match=message):
+        draft(path.name, path)
+    text, problems = sketch(path.name, path, strip)
+    assert problems == []
+    robot = build(parse_robot_file(text, tmp_path / "drafted.toml")).robot
+    assert robot.total_mass == pytest.approx(9 if path.suffix == ".xml" else TOTAL)
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+def test_a_mass_of_the_whole_is_shared_before_bodies_are_stripped(tmp_path: Path) -> None:
+    """Of 20 kg for masses of 9 + 1, the robot keeps 18."""
+    arm = '<body name="arm"><geom size=".02" mass="1"/></body>'
+    text = walker(more=arm).replace("<compiler ", '<compiler settotalmass="20" ')
+    (tmp_path / "model.xml").write_text(text)
+    text, _ = sketch("model.xml", tmp_path / "model.xml", ["arm"])
+    robot = build(parse_robot_file(text, tmp_path / "drafted.toml")).robot
+    assert robot.total_mass == pytest.approx(18)
+
+
 @pytest.mark.parametrize("base", ["world", "base", "odom"])
 def test_a_trunk_on_a_floating_joint(base: str, tmp_path: Path) -> None:
     """Its root is no part of the robot."""
