@@ -57,7 +57,7 @@ def robot_row(robot: str, path: Path, scenarios: int) -> Row:
         "height": f"{1000 * policy.config.task.body_height:.0f} mm",
         "training": f"{times[robot]:.0f} s",
     }
-    scene, title = policy_scene(policy), " / ".join(("policy", *PEERS))
+    scene, title = policy_scene(policy, robot), " / ".join(("policy", *PEERS))
     for suite, divisor in SUITES.items():
         common.log(f"{robot}, {suite} ...")
         count, results = scenarios // divisor, []

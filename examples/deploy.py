@@ -22,11 +22,13 @@ def main() -> None:
     """Balances on a board that tilts on both axes at once, and prints the mean tilt."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
     parser.add_argument("policy", help="file, run folder, or name of a shipped policy")
+    parser.add_argument("--robot", help="its robot, if not shipped: TOML file or menagerie:NAME")
+    args = parser.parse_args()
     try:
-        path = find_policy(parser.parse_args().policy)
+        path = find_policy(args.policy)
+        scene = policy_scene(load_policy(path), args.robot)  # the policy itself runs below
     except PolicyError as error:
         parser.error(str(error))
-    scene = policy_scene(load_policy(path))  # board and robot; the policy itself runs below
     model, stance, task = scene.model, scene.stance, scene.task
     data = mujoco.MjData(model)
     data.qpos, data.qacc_warmstart = stance.qpos, stance.qacc_warmstart

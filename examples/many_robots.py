@@ -101,8 +101,9 @@ def judged(policy: Policy, suite: str, scenarios: int) -> str:
 def main() -> None:
     """Trains, writes, judges."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
-    parser.add_argument("--robots", nargs="+", default=shipped())
-    parser.add_argument("--unseen", nargs="*", default=[], help="robots to be judged on alone")
+    parser.add_argument("--robots", nargs="+", default=shipped(), choices=shipped())
+    unseen = "robots to be judged on alone"
+    parser.add_argument("--unseen", nargs="*", default=[], choices=shipped(), help=unseen)
     parser.add_argument("--preset", default="best")
     parser.add_argument("--decisions", type=int, default=60_000, help="of each robot")
     parser.add_argument("--envs", type=int, default=32, help="of each robot")

@@ -432,7 +432,7 @@ def test_some_repeated_samples_are_no_dead_imu(
 @pytest.mark.parametrize("bias", [0.0, 0.0001])
 def test_a_coarse_gyro_of_a_robot_that_is_still_is_not_dead(rig: Rig, bias: float) -> None:
     """Of 2,000 deg/s in 16 bits, with noise of a fifth of a step: few of its samples are new."""
-    step, new, last = math.radians(2000 / 2**15), [], None
+    step, new, last = math.radians(2000 / 2**15), [], np.zeros(3)
     for k in range(501):
         gyro = np.round(rig.rng.normal(bias, step / 5, 3) / step) * step
         if k % 50 == 1:
@@ -663,8 +663,8 @@ def test_the_file_alone_runs_the_shipped_policy(tmp_path: Path, rig: Rig) -> Non
     np.testing.assert_array_equal(np.asarray(targets, float), expected.ravel())
 
 
-def example(policy: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(REPO / "examples/deploy.py"), policy]
+def example(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(REPO / "examples/deploy.py"), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=REPO)
 
 
@@ -680,5 +680,20 @@ def test_the_example_balances_as_the_evaluation_does() -> None:
 def test_the_example_says_what_it_needs() -> None:
     run = example("nobody")
     assert (run.returncode, run.stdout) == (2, "")
-    assert run.stderr.startswith("usage: deploy.py [-h] policy\n")
+    assert run.stderr.startswith("usage: deploy.py [-h] [--robot ROBOT] policy\n")
     assert "error: no policy file at nobody;" in run.stderr
+
+
+@pytest.mark.slow
+def test_the_example_takes_a_robot_that_is_not_shipped(tmp_path: Path) -> None:
+    """Which a policy cannot name: here Spot, with its shipped policy under another robot's name."""
+    path = str(tmp_path / "p.safetensors")
+    shutil.copy(REPO / "policies/robots/spot.safetensors", path)
+    rewrite(Path(path), lambda w, m: m["config"].update(robot="elsewhere.toml"))
+    run = example(path)
+    assert (run.returncode, run.stdout) == (2, "")
+    assert "deploy.py: error: the policy's robot is 'elsewhere.toml'; " in run.stderr
+    assert "with --robot" in run.stderr
+    run = example(path, "--robot", "spot")
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith("mean tilt 0.")

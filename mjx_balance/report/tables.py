@@ -12,6 +12,7 @@ from rich.table import Table
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.files.text import PATH, shell, shorten
+from mjx_balance.robots.catalogue import shipped
 
 STATISTICS = ("mean", "p50", "p95", "p99", "max")  #: tilt statistics in the table of an evaluation
 
@@ -81,13 +82,21 @@ def print_table(console: Console, table: Table) -> None:
 
 
 def print_summary(
-    console: Console, run_dir: Path, results: dict[str, dict[str, Any]], seconds: float
+    console: Console,
+    run_dir: Path,
+    results: dict[str, dict[str, Any]],
+    seconds: float,
+    robot: str = "quadruped",
 ) -> None:
-    """Prints a run's results, JSON of `summarize` by suite, its files and the seconds it took."""
+    """Prints a run's results, JSON of `summarize` by suite, its files and the seconds it took.
+
+    The commands that it prints name the run's `robot` if it is not shipped.
+    """
     folder = RunFolder(run_dir)
+    flag = "" if robot in shipped() else f" --robot {shell(Path(robot))}"
     print_table(console, evaluation_table(results))
     for path, what in (
-        (folder.policy, "the policy; `mjx-balance evaluate` runs it"),
+        (folder.policy, f"the policy; `mjx-balance evaluate{escape(flag)}` runs it"),
         (folder.evaluation, "the table above"),
         (f"{folder.figures}/", "learning curves, rewards, 100 s on the board"),
         (folder.metrics, f"every logged number; {folder.tensorboard.name}/ has them too"),
@@ -97,7 +106,10 @@ def print_summary(
             f"{escape(shorten(path, PATH))}  [dim]{what}[/dim]", highlight=False, soft_wrap=True
         )
     console.print(
-        f"`mjx-balance report {shell(run_dir)}` makes a page of it", highlight=False, markup=False
+        f"`mjx-balance report {shell(run_dir)}{flag}` makes a page of it",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
     )
     console.print(f"done in {seconds:.0f} s", highlight=False)
 

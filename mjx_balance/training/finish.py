@@ -106,7 +106,8 @@ def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
         reason = shorten(error, MESSAGE) or type(error).__name__
         run.display.say(f"not all figures and curves are there: {reason}")
     folder.drawing.unlink()
-    tables.print_summary(console, folder.path, results, time.perf_counter() - start_time)
+    took = time.perf_counter() - start_time
+    tables.print_summary(console, folder.path, results, took, config.robot)
     return results
 
 

@@ -1,6 +1,7 @@
 """Tables of a terminal: every cell under its heading, in 80 columns."""
 
 import io
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,16 @@ def test_the_summary_names_every_file_of_the_run() -> None:
     assert "`mjx-balance report 'runs/a[b]'` makes a page of it" in text
     assert "0.068" in text
     assert text.endswith("done in 62 s\n")
+
+
+@pytest.mark.parametrize("robot", ["my robot.toml", "menagerie:unitree_h1", "go2"])
+def test_the_summarys_commands_name_a_robot_that_is_not_shipped(robot: str) -> None:
+    """`evaluate` and `report` refuse the policy without it."""
+    out = io.StringIO()
+    tables.print_summary(Console(width=80, file=out), Path("runs/a"), {}, 1.0, robot)
+    flag = "" if robot == "go2" else f" --robot {shlex.quote(robot)}"
+    assert f"`mjx-balance report runs/a{flag}` makes a page of it" in out.getvalue()
+    assert f"`mjx-balance evaluate{flag}` runs it\n" in out.getvalue()
 
 
 @pytest.mark.parametrize("width", [10, 39, 59])
