@@ -47,7 +47,8 @@ def read_config(file: Path) -> Config:
 def read_run_config(path: Path) -> Config:
     """Reads the config of an unfinished run.
 
-    A robot file that is not where the config says from here has the path at which the run began.
+    A robot file has the path at which the run began, unless it is gone from there: from here, the
+    config's own path may lead to another robot.
 
     Raises:
       RunFolderError: if `path` is not a run folder, its run is finished, or its config is invalid.
@@ -58,11 +59,12 @@ def read_run_config(path: Path) -> Config:
     except ValueError as error:
         reason = shorten(error, MESSAGE)
         raise RunFolderError(f"{folder.config} cannot be used: {reason}") from error
-    if _is_file(config.robot) and not os.path.isfile(config.robot):
+    if _is_file(config.robot):
         with contextlib.suppress(ValueError, LookupError, TypeError):  # `check_same_provenance`
             began_with = read_json(folder.provenance)["robot_file"]
             if isinstance(began_with, str) and os.path.isfile(began_with):
-                return dataclasses.replace(config, robot=began_with)
+                here = os.path.isfile(config.robot) and os.path.samefile(config.robot, began_with)
+                return config if here else dataclasses.replace(config, robot=began_with)
     return config
 
 

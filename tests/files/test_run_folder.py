@@ -264,7 +264,7 @@ def test_other_versions_give_a_warning(folder: RunFolder) -> None:
     assert "mujoco" not in warning
 
 
-def test_a_robot_file_is_where_the_config_says_or_where_the_run_began(
+def test_a_robot_file_is_where_the_run_began_or_else_where_the_config_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "work").mkdir()
@@ -275,10 +275,14 @@ def test_a_robot_file_is_where_the_config_says_or_where_the_run_began(
     path = create_run_folder(tmp_path / "run", to_dict(config), today).path
     monkeypatch.chdir(tmp_path)
     assert read_run_config(path).robot == str(there)
-    here.touch()
-    assert read_run_config(path).robot == "rex.toml"
-    for gone in (here, there):
-        gone.unlink()
+    monkeypatch.chdir(there.parent)
+    assert read_run_config(path).robot == "rex.toml", "as the config of the policy names it"
+    monkeypatch.chdir(tmp_path)
+    here.touch()  # of the same name, but another robot
+    assert read_run_config(path).robot == str(there)
+    there.unlink()
+    assert read_run_config(path).robot == "rex.toml", "the run has moved with its robot"
+    here.unlink()
     for place in (0, 3, None, "x" * 100_000, "a\0b", ["rex.toml"], -1):
         RunFolder(path).provenance.write_text(json.dumps(today | {"robot_file": place}))
         assert read_run_config(path).robot == "rex.toml"
