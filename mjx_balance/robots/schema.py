@@ -22,9 +22,6 @@ Place = tuple[Number, Number, Number]  #: x, y and z, m
 class RobotError(ConfigError):
     """A robot that cannot be found, read or built; the message says why, in one short line."""
 
-    def __init__(self, message: str) -> None:
-        super().__init__(shorten(message, MESSAGE))
-
 
 @dataclasses.dataclass(frozen=True)
 class Foot:

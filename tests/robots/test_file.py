@@ -123,6 +123,17 @@ def test_no_file_and_no_text(tmp_path: Path) -> None:
         find_robot(str(tmp_path / "x.toml"))
 
 
+def test_a_long_path_leaves_the_remedy(tmp_path: Path) -> None:
+    path = tmp_path.joinpath(*["x" * 100] * 5, "rex.toml")
+    with pytest.raises(RobotError, match=r"`mjx-balance robot new MODEL\.xml` drafts one$") as caught:
+        find_robot(str(path))
+    assert len(str(caught.value)) <= 300
+    path.parent.mkdir(parents=True)
+    path.write_text(TEXT.replace("stripe", "strip").replace("strip =", "stripe ="))
+    with pytest.raises(RobotError, match=r"'stripe' in RobotFile; did you mean strip\?$"):
+        find_robot(str(path))
+
+
 def test_shipped_files_name_their_source_and_are_short() -> None:
     """What a user writes for the worst of them: 45 lines at most, 25 with an IMU site."""
     assert shipped() == ["aliengo", "b2", "go1", "go2", "mini_cheetah", "quadruped", "spot"]
