@@ -214,6 +214,8 @@ _TAG = re.compile(
     rb"<\s*(replicate|composite|flexcomp|mesh|hfield|include|model)\b((?:[^\"'>]|\"[^\"]*\"|'[^']*')*+)"
 )
 _PERCENT = re.compile(rb"=\s*(?:\"[^\"]*?(?:%|&#)[^\"]*\"|'[^']*?(?:%|&#)[^']*')")
+_TOKEN = re.compile(rb"<!--.*?-->|(<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*+>)", re.DOTALL)
+_HEAD = re.compile(rb"\A\s*<\?xml[^<>]*\?>")
 _ATTRIBUTE = re.compile(r"([\w:]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
 
 
@@ -233,7 +235,8 @@ def _check_text(path: Path) -> None:
                     f"{path.name} has {text.count(tag)} times {tag.decode()}; it may have {most}"
                 )
         # MuJoCo hands an error's text to printf as its format: a name with %n ends the process.
-        for value in map(bytes.decode, _PERCENT.findall(text.decode(errors="replace").encode())):
+        plain = _without_comments(text).decode(errors="replace").encode()
+        for value in map(bytes.decode, _PERCENT.findall(plain)):
             if "%" in html.unescape(value):
                 raise RobotError(f"{path.name} has an attribute {quote(value)}; it must have no %")
         for tag, attributes in _TAG.findall(text):
@@ -266,6 +269,14 @@ def _check_text(path: Path) -> None:
             f"{path.name} repeats elements up to {copies:.3g} times by replicate, composite or "
             f"flexcomp; at most {MAX_COPIES} times"
         )
+
+
+def _without_comments(text: bytes) -> bytes:
+    """XML without its comments; with them if what else it has could hide where they begin."""
+    text = _HEAD.sub(b"", text, count=1)
+    if b"<?" in text or text.count(b"<!") > text.count(b"<!--"):
+        return text
+    return _TOKEN.sub(lambda match: match[1] or b"", text)
 
 
 def _integers(text: str) -> list[int]:
@@ -349,6 +360,7 @@ def _drop_unreadable(spec: mujoco.MjSpec) -> list[str]:
 def _file(spec: mujoco.MjSpec, element: mujoco.MjsMesh | mujoco.MjsTexture, name: str) -> Path:
     """Path of an asset's file."""
     mesh = isinstance(element, mujoco.MjsMesh)
+    name = Path(name).name if spec.strippath else name
     folder = element.compiler.meshdir if mesh else element.compiler.texturedir
     return Path(spec.modelfiledir, folder, name)
 

@@ -125,7 +125,7 @@ def test_no_file_and_no_text(tmp_path: Path) -> None:
 
 def test_a_long_path_leaves_the_remedy(tmp_path: Path) -> None:
     path = tmp_path.joinpath(*["x" * 100] * 5, "rex.toml")
-    with pytest.raises(RobotError, match=r"`mjx-balance robot new MODEL\.xml` drafts one$") as caught:
+    with pytest.raises(RobotError, match=r"`mjx-balance robot new .*` drafts one$") as caught:
         find_robot(str(path))
     assert len(str(caught.value)) <= 300
     path.parent.mkdir(parents=True)

@@ -279,6 +279,19 @@ def test_pictures_that_are_missing_stop_nothing(tmp_path: Path) -> None:
         drafted(tmp_path, text.replace('mesh="hull" mass="0"', 'mesh="hull"'), "model.xml")
 
 
+def test_paths_of_assets_are_stripped_where_the_model_says(tmp_path: Path) -> None:
+    """To their names, under the folders of meshes and of textures."""
+    stl(tmp_path / "assets" / "hull.stl")
+    imageio.imwrite(tmp_path / "assets" / "skin.png", np.zeros((4, 4, 3), np.uint8))
+    assets = """<compiler strippath="true" assetdir="assets"/><asset><mesh name="hull"
+    file="/home/maker/hull.stl"/><texture name="skin" type="2d" file="../maker/skin.png"/>
+    <material name="skin" texture="skin"/></asset><worldbody>"""
+    more = '<geom type="mesh" mesh="hull" material="skin" contype="0" conaffinity="0"/>'
+    text = walker(more=more).replace("<worldbody>", assets)
+    shown = drafted(tmp_path, text, "model.xml", visual=True).spec.compile()
+    assert (shown.nmesh, shown.ntex) == (1, 1)
+
+
 def test_a_texture_of_six_files_is_shown(tmp_path: Path) -> None:
     """Each a PNG of its own, in the texture folder; one of too many points is left out."""
     (tmp_path / "textures").mkdir()
@@ -447,6 +460,14 @@ def test_an_empty_root(mass: float, tmp_path: Path) -> None:
     assert (got.robot.trunk, got.robot.trunk_mass) == ("base", pytest.approx(6.92, abs=1e-5))
 
 
+@pytest.mark.parametrize("head", ["", '<?xml version="1.0"?>\n'])
+def test_a_percent_in_a_comment_is_no_harm(head: str, tmp_path: Path) -> None:
+    """In any number of them, and beside a name that looks like the begin of one."""
+    comment = '<!-- kp="80%" <joint name="%n"/> --><site name="a&lt;!--"/><!-- friction=\'5 %\' -->'
+    text = head + walker().replace("<freejoint/>", f"<freejoint/>{comment}")
+    assert drafted(tmp_path, text, "model.xml").robot.total_mass == pytest.approx(9)
+
+
 HUGE = {
     # content of the model, or of its trunk; message
     "ground": (
@@ -469,6 +490,18 @@ HUGE = {
     "pipe": ('<include file="pipe"/>', "includes '.*pipe', which is no regular file"),
     "megabytes": (f"<!--{'x' * 2**24}-->", "has more than 16 MiB of XML"),
     "format": ('<site class="%s%n"/>', "has an attribute .*; it must have no %"),
+    "format after what is no comment": (
+        '<site class="<!--"/><site class="%s%n"/><!-- -->',
+        "has an attribute .*; it must have no %",
+    ),
+    "format in a quote": (
+        "<site name='\"' class='<!--'/><site class='%n'/><!-- -->",
+        "has an attribute .*; it must have no %",
+    ),
+    "format after other marks": (
+        '<![CDATA[ > <!-- ]]><site class="%n"/><!-- -->',
+        "has an attribute .*; it must have no %",
+    ),
     "hidden format": ("<site class='&#37;n'/>", "has an attribute .*; it must have no %"),
     "plugin": ('<plugin plugin="mujoco.elasticity.cable"/>', "plugin|cannot be read"),
 }
