@@ -45,7 +45,7 @@ MOST_MANIFEST = 4 * 2**20  #: greatest size of its manifest, characters
 MOST_MESSAGE, MOST_PATH, MOST_NAME = 300, 150, 100  #: greatest lengths of texts, characters
 MOST_WEIGHTS, MOST_LEGS, MOST_LAYERS, MOST_FACTORS = 1_000, 16, 64, 8
 MOST_SAMPLES = 10_000  #: greatest number of samples per decision
-LEAST_SCALE = 1e-6  #: least scale of an input; it keeps inputs finite
+SCALES = (float(np.float32(1e-6)), 1e6)  #: bounds of an input's scale; they keep inputs finite
 MOST_TURN = 16.0  #: greatest turn of a joint at angle 0, rad; two and a half turns are 15.7
 MOST_WHOLE = 100_000  #: bound of a manifest's numbers
 MOMENTARY = ("height",)  #: sensors with one sample per decision and no history
@@ -194,7 +194,7 @@ class Controller:
           (legs, 3) joint position targets, rad.
 
         Raises:
-          ValueError: if an array of numbers has another shape.
+          ValueError: if an array of the first sample has another shape; later ones make it hold.
         """
         try:
             self._read_sensors(joint_positions, gyro, accelerometer)
@@ -210,7 +210,8 @@ class Controller:
         joints, gyro, accel = (_reading(*pair) for pair in zip(names, arguments))
         if joints.shape != self._targets.shape or gyro.shape != (3,) or accel.shape != (3,):
             shapes = [_line(x.shape, 40) for x in (joints, gyro, accel)]
-            raise ValueError(
+            kind = ValueError if self.state is State.STANDING else _Unsafe
+            raise kind(
                 f"joint_positions, gyro and accelerometer have shapes {shapes[0]}, {shapes[1]} "
                 f"and {shapes[2]}; they must be {self._targets.shape}, (3,) and (3,)"
             )
@@ -384,9 +385,7 @@ class _Inputs:
             raise PolicyFileError("its inputs are means of more samples than there are")
         self.size = len(rows)
         self._offset = _numbers("offset", [row["offset"] for row in rows], (self.size,))
-        self._scale = _numbers("scale", [row["scale"] for row in rows], (self.size,))
-        if not (self._scale >= LEAST_SCALE).all():
-            raise PolicyFileError(f"its scale has entries below {LEAST_SCALE:g}")
+        self._scale = np.asarray([_number("scale", row["scale"], *SCALES) for row in rows])
         self._groups = []
         for (sensor, window), group in groups.items():
             places, index, lags = np.asarray(group, int).T
@@ -591,8 +590,9 @@ def _reason(error: Exception) -> str:
 def _reading(name: str, values: Any) -> np.ndarray:
     """A sensor's reading as numbers; `_Unsafe` for what a broken driver may give instead."""
     try:
-        if values is not None:  # which NumPy would take for NaN
-            return np.asarray(values, float)
+        array = np.asarray(values)
+        if array.dtype.kind in "fiub":  # NumPy would take None for NaN, and read text
+            return array.astype(float)
     except Exception:
         pass
     raise _Unsafe(f"{name} is a value of type {type(values).__name__}; it must be numbers")

@@ -184,6 +184,16 @@ def test_it_is_the_tasks_decision_for_any_layout_and_legs(
     assert len(set(actions)) > 4
 
 
+@pytest.mark.parametrize("scale", [1e-6, 1e5, 1e6])
+@pytest.mark.parametrize("field", ["height_scale", "gyro_scale", "accel_scale"])
+def test_it_runs_whatever_scale_a_config_may_have(
+    tmp_path: Path, config: Config, field: str, scale: float
+) -> None:
+    """Which float32 rounds to below its bound."""
+    random_policy(tmp_path / "p", with_head(config, "radial", **{field: scale}))
+    Rig(tmp_path / "p").steps(51)
+
+
 def test_legs_are_held_within_their_reach(tmp_path: Path, config: Config, robot: Robot) -> None:
     """Roll by 10 cm per decision: the left legs end at their longest, the right at shortest."""
     config = with_head(config, "joint", action_max=0.1)
@@ -545,6 +555,31 @@ def test_arguments_of_another_shape_are_refused(rig: Rig, arguments: tuple[Any, 
     assert rig.controller.state is State.BALANCING
 
 
+SHORT = {
+    "two": [0, 0],
+    "none": [],
+    "scalar": 9.81,
+    "four": [0, 0, 9.81, 0],
+    "column": [[0], [0], [9]],
+}
+
+
+@pytest.mark.parametrize("value", SHORT.values(), ids=SHORT)
+@pytest.mark.parametrize("argument", range(3))
+def test_a_short_packet_after_a_good_one_makes_it_hold(rig: Rig, argument: int, value: Any) -> None:
+    """At the first sample the program is wrong, later a driver is."""
+    last = rig.steps(60)[-1]
+    readings: list[Any] = [JOINTS, np.zeros(3), np.array([0, 0, 9.81])]
+    readings[argument] = value
+    for _ in range(2):
+        np.testing.assert_array_equal(rig.controller.step(*readings), last)
+    assert rig.controller.state is State.HOLDING
+    assert re.match(r"joint_positions, gyro and .* must be \(4, 3\), ", rig.controller.reason)
+    rig.controller.reset()
+    with pytest.raises(ValueError, match="have shapes"):
+        rig.controller.step(*readings)
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_the_greatest_outputs_choose_the_last_level_without_a_warning(
     tmp_path: Path, config: Config, sign: int
@@ -568,6 +603,10 @@ NO_NUMBERS = {
     "text": "standing",
     "set": {1.0, 2.0},
     "one text": [0, "x", 9.81],
+    "numbers as text": ["0", "0", "9.81"],
+    "numbers as bytes": [b"0", b"0", b"9.81"],
+    "complex": np.array([0, 0, 9.81 + 1j]),
+    "times": np.array([0, 0, 9], "m8[s]"),
     "one dict": [0, {}, 9.81],
     "great": 10**400,
     "one great": [10**400, 0, 0],
