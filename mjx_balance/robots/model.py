@@ -349,12 +349,22 @@ def _drop_unreadable(spec: mujoco.MjSpec) -> list[str]:
         spec.delete(geom)
     for mesh in gone.values():
         spec.delete(mesh)
-    for texture in [x for x in spec.textures if not _drawable(spec, x)]:
+    blank = [x for x in spec.textures if not _drawable(spec, x)]
+    files = [file for x in blank for file in (x.file, *x.cubefiles) if file]
+    for texture in blank:
         for material in spec.materials:
             material.textures = ["" if x == texture.name else x for x in material.textures]
         spec.delete(texture)
-    files = ", ".join(sorted({Path(x.file).name for x in gone.values()}))
-    return [f"not shown, for they are no readable STL, OBJ or MSH files: {files}"] if gone else []
+    kinds = {
+        "STL, OBJ or MSH files": [mesh.file for mesh in gone.values()],
+        "textures": files,
+    }
+    return [
+        f"not shown, for they are no readable {kind}: "
+        f"{', '.join(sorted({Path(x).name for x in y}))}"
+        for kind, y in kinds.items()
+        if y
+    ]
 
 
 def _file(spec: mujoco.MjSpec, element: mujoco.MjsMesh | mujoco.MjsTexture, name: str) -> Path:

@@ -274,6 +274,7 @@ def test_pictures_that_are_missing_stop_nothing(tmp_path: Path) -> None:
     text = text.replace("<worldbody>", assets).replace('mass="5"', 'mass="5" material="skin"')
     got = drafted(tmp_path, text, "model.xml", visual=True)
     assert got.notes[0].endswith("files: hull.stl")
+    assert got.notes[1].endswith("no readable textures: skin.png")
     assert got.spec.compile().ntex == 0
     with pytest.raises(RobotError, match=r"mesh 'hull.stl', by which body 'trunk' is weighed"):
         drafted(tmp_path, text.replace('mesh="hull" mass="0"', 'mesh="hull"'), "model.xml")
