@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fixtures.fleet import RANDOM, with_state
+from fixtures.fleet import RANDOM, episodes_of, with_state
 
 from mjx_balance.config import preset
 from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.evaluation.rollout import roll_out
 from mjx_balance.machine import cores
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.engines import ffi
@@ -43,6 +44,32 @@ def engine(scene: Scene) -> JaxEngine:
 
 def in_double(tree: Any) -> dict[str, np.ndarray]:
     return {name: np.asarray(x, float) for name, x in tree._asdict().items()}
+
+
+def test_training_and_evaluation_have_the_same_physics(compiled: Any) -> None:
+    """10 s under feedback, payload, friction, gains and latency; what differs is float32."""
+    env, start = compiled.env, compiled.reset(compiled.keys(1))
+    quiet = start.pipeline_state.params._replace(imu_noise=jnp.zeros((ENVS, 6)))
+    act = compiled.feedback(EPISODE)
+    states = compiled.drive(compiled.under(start, quiet), act, EPISODE)
+    tilt = np.asarray([state.metrics["tilt_deg"] for state in states[1:]])
+    rollout = roll_out(
+        env.scene,
+        lambda view: act(view.obs, view.env_steps),
+        episodes_of(states[0]),
+        10.0,
+        record=True,
+    )
+    assert not rollout.fell.any()
+    theirs = rollout.tilt.reshape(ENVS, EPISODE, -1).mean(axis=-1).T
+    assert rollout.qpos is not None
+    # The first second, before an observation at the edge of two actions has chosen another one.
+    qpos = np.asarray([state.pipeline_state.physics.qpos for state in states[1:6]])
+    np.testing.assert_allclose(qpos, rollout.qpos[:, 49:250:50].swapaxes(0, 1), atol=2e-5)
+    np.testing.assert_allclose(tilt[:5], theirs[:5], atol=2e-4)
+    assert tilt.mean() == pytest.approx(theirs.mean(), rel=0.01)
+    assert np.percentile(tilt, 95) == pytest.approx(np.percentile(theirs, 95), rel=0.02)
+    assert tilt.max() == pytest.approx(theirs.max(), rel=0.05)
 
 
 def random_params(seed: int, count: int) -> DomainParams:
