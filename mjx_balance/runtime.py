@@ -38,6 +38,7 @@ FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts it"
 ACTION = "grid"  #: the only kind of action: a row of `actions.table_m`
 SENSORS = ("gyro", "accelerometer")
+ARGUMENTS = ("joint_positions", *SENSORS)  #: of `step`
 IMU = 6  #: gyro x, y and z, accelerometer x, y and z
 MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
 MOST_HEADER = 8 * 2**20  #: greatest size of its header
@@ -206,8 +207,7 @@ class Controller:
 
     def _read_sensors(self, *arguments: np.ndarray) -> None:
         """Checks shapes, and copies all readings to `_reading`: joints, gyro, accelerometer."""
-        names = ("joint_positions", "gyro", "accelerometer")
-        joints, gyro, accel = (_reading(*pair) for pair in zip(names, arguments))
+        joints, gyro, accel = map(_numeric, ARGUMENTS, arguments)
         if joints.shape != self._targets.shape or gyro.shape != (3,) or accel.shape != (3,):
             shapes = [_line(x.shape, 40) for x in (joints, gyro, accel)]
             kind = ValueError if self.state is State.STANDING else _Unsafe
@@ -215,9 +215,7 @@ class Controller:
                 f"joint_positions, gyro and accelerometer have shapes {shapes[0]}, {shapes[1]} "
                 f"and {shapes[2]}; they must be {self._targets.shape}, (3,) and (3,)"
             )
-        self._reading[:-IMU] = joints.ravel()
-        self._reading[-IMU:-3] = gyro
-        self._reading[-3:] = accel
+        np.concatenate((joints.ravel(), gyro, accel), out=self._reading)
 
     def _time(self) -> float:
         try:
@@ -251,13 +249,12 @@ class Controller:
 
     def _check_reading(self) -> None:
         sane = (self._least <= self._reading) & (self._reading <= self._most)  # NaN is not
-        if sane.all():
-            return
-        k = int(np.argmin(sane))
-        raise _Unsafe(
-            f"{self._name(k)} reads {self._reading[k]:.3g}, which is not between "
-            f"{self._least[k]:.3g} and {self._most[k]:.3g}"
-        )
+        k = int(sane.argmin())
+        if not sane[k]:
+            raise _Unsafe(
+                f"{self._name(k)} reads {self._reading[k]:.3g}, which is not between "
+                f"{self._least[k]:.3g} and {self._most[k]:.3g}"
+            )
 
     def _name(self, k: int) -> str:
         """Name of reading `k`."""
@@ -285,7 +282,8 @@ class Controller:
     def _check_liveness(self) -> None:
         """Checks that the IMU's samples differ, and that joints move if their targets do."""
         recent = self._imu[-self._recent :]
-        self._check_new("IMU", len(set(map(bytes, recent))), len(recent), LIVELY)
+        different = len(set(recent.view(f"V{recent.itemsize * IMU}")[:, 0].tolist()))
+        self._check_new("IMU", different, len(recent), LIVELY)
         joints, targets = self._reading[:-IMU], self._targets.ravel()
         if np.abs(joints - self._poses[0]).max() > MOVED_LEAST:
             since = self._imu[-max(self._recent, self.decision_samples) :]
@@ -295,8 +293,8 @@ class Controller:
         self._there = np.where(joints != self._poses[-1], targets, self._there)
         self._poses.append(joints.copy())
         moved = np.abs(targets - self._there)
-        if moved.max() > STUCK_MOST:
-            k = int(moved.argmax())
+        k = int(moved.argmax())
+        if moved[k] > STUCK_MOST:
             raise _Unsafe(
                 f"{self._name(k)} reads {joints[k]:.3g} all the time, while its target moved by "
                 f"{moved[k]:.2g} rad"
@@ -313,8 +311,8 @@ class Controller:
 
     def _check_posture(self) -> None:
         """Checks the mean of a decision's IMU samples, and the joints, for a balancing robot."""
-        gyro, accel = np.split(self._imu[self._history :].mean(axis=0), 2)
-        weight, rate = float(np.linalg.norm(accel)), float(np.linalg.norm(gyro[:2]))
+        x, y, _, *accel = self._imu[self._history :].mean(axis=0).tolist()
+        weight, rate = math.hypot(*accel), math.hypot(x, y)
         if not WEIGHT[0] <= weight <= WEIGHT[1]:
             raise _Unsafe(
                 f"the accelerometer gives {weight:.3g} m/s^2 in the mean of a decision; it must be "
@@ -350,13 +348,12 @@ class Controller:
         self._since, self._decided = 0, now
 
     def _observation(self) -> np.ndarray:
-        gyro, accelerometer = np.split(self._imu, 2, axis=1)
         return self._inputs.observe(
             {
                 "height": self._legs.foot_heights(self._reading[:-IMU].reshape(-1, 3))[None],
                 "command": self._commands,
-                "gyro": gyro,
-                "accelerometer": accelerometer,
+                "gyro": self._imu[:, :3],
+                "accelerometer": self._imu[:, 3:],
             }
         )
 
@@ -508,7 +505,7 @@ class _Network:
     def _nearest(self, out: np.ndarray, axis: int) -> int:
         """The level nearest to the best point of a radial head, whose outputs are V and mu."""
         last = np.float32(self.factors[axis] - 1)
-        return int(np.rint((np.clip(out[1 + axis], -1, 1) + 1) * last / 2))
+        return int(np.rint((min(max(out[1 + axis], -1), 1) + 1) * last / 2))
 
     def _best(self, out: np.ndarray, axis: int) -> int:
         """The level of the greatest value."""
@@ -587,12 +584,12 @@ def _reason(error: Exception) -> str:
     return f"a part of its manifest has the wrong type: {error}"
 
 
-def _reading(name: str, values: Any) -> np.ndarray:
-    """A sensor's reading as numbers; `_Unsafe` for what a broken driver may give instead."""
+def _numeric(name: str, values: Any) -> np.ndarray:
+    """A sensor's reading as an array; `_Unsafe` for what a broken driver may give instead."""
     try:
         array = np.asarray(values)
         if array.dtype.kind in "fiub":  # NumPy would take None for NaN, and read text
-            return array.astype(float)
+            return array
     except Exception:
         pass
     raise _Unsafe(f"{name} is a value of type {type(values).__name__}; it must be numbers")
