@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from mjx_balance.files.text import MESSAGE, shorten
+from mjx_balance.text import MESSAGE, shorten
 
 FAILED = 1
 USAGE_ERROR = 2

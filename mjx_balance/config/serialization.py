@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 from mjx_balance.config.schema import Config, ConfigError
 from mjx_balance.config.validation import check
 from mjx_balance.files.run_folder import RunFolderError, read_json, unfinished_run
-from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.files.validation import parse
+from mjx_balance.text import MESSAGE, shorten
 
 T = TypeVar("T")
 

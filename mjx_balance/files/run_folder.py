@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mjx_balance.errors import InputError
-from mjx_balance.files import text
-from mjx_balance.files.text import MESSAGE, shell, shorten
+from mjx_balance.text import MESSAGE, PATH, shell, shorten
 
 if sys.platform == "win32":
     import msvcrt
@@ -23,7 +22,7 @@ else:
 
 READ_AT_MOST = 2**20  #: greatest size of a JSON file of a run, bytes; usual ones have some kB
 LONGEST_LINE = 2**22  #: of metrics.jsonl, bytes; thousands of seeds fit
-PATH = 150  #: greatest length of a path in the middle of a message, characters
+PLACE = 150  #: greatest length of a path in the middle of a message, characters
 PART = ".mjx_balance-{}.part"  #: name of a file or folder that is not complete yet
 
 
@@ -34,7 +33,7 @@ class RunFolderError(InputError):
 class RunFolderExistsError(RunFolderError):
     """The folder of a new run exists."""
 
-    limit = text.PATH  # it ends in a command with the user's own path, to be copied
+    limit = PATH  # it ends in a command with the user's own path, to be copied
 
 
 class RunFolder:
@@ -139,7 +138,7 @@ def create_run_folder(
             ) from error
         reason = error.strerror
         if error.errno == errno.EEXIST:
-            reason = f"{shorten(error.filename, PATH)} is a link to what does not exist"
+            reason = f"{shorten(error.filename, PLACE)} is a link to what does not exist"
         raise RunFolderError(
             f"run folder {path} cannot be written: {reason}; choose another with --run-dir"
         ) from error
@@ -164,7 +163,7 @@ def check_contained(path: Path) -> RunFolder:
                 real = os.path.realpath(entry)
                 if os.path.commonpath((root, real)) != root:
                     raise RunFolderError(
-                        f"{shorten(entry, PATH)} is a link that leads out of the run folder; "
+                        f"{shorten(entry, PLACE)} is a link that leads out of the run folder; "
                         "put a copy of its target in its place"
                     )
                 mode = os.stat(entry).st_mode
@@ -175,13 +174,13 @@ def check_contained(path: Path) -> RunFolder:
                 entries += (each.path for each in os.scandir(entry))
             elif not stat.S_ISREG(mode):
                 raise RunFolderError(
-                    f"{shorten(entry, PATH)} is neither a file nor a folder; remove it"
+                    f"{shorten(entry, PLACE)} is neither a file nor a folder; remove it"
                 )
         except OSError as error:
             if isinstance(error, FileNotFoundError) and not os.path.lexists(entry):
                 continue  # a run that goes on has renamed it
             raise RunFolderError(
-                f"{shorten(entry, PATH)} cannot be read: {error.strerror}"
+                f"{shorten(entry, PLACE)} cannot be read: {error.strerror}"
             ) from error
     return folder
 

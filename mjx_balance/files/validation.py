@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from mjx_balance.errors import InputError
-from mjx_balance.files.text import MESSAGE, quote, shorten
+from mjx_balance.text import MESSAGE, quote, shorten
 
 T = TypeVar("T")
 

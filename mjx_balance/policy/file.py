@@ -11,9 +11,9 @@ import safetensors
 import safetensors.numpy
 
 from mjx_balance.files.run_folder import RunFolder, write_atomically
-from mjx_balance.files.text import quote
 from mjx_balance.policy.manifest import PolicyError, naming, upgrade
 from mjx_balance.policy.network import Policy
+from mjx_balance.text import quote
 
 MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
 MOST_HEADER = 8 * 2**20  #: greatest size of its header

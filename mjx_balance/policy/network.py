@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_balance.files.text import quote
 from mjx_balance.policy import heads
 from mjx_balance.policy.manifest import PolicyError, network_factors, read_manifest
 from mjx_balance.task.actions import action_table
+from mjx_balance.text import quote
 
 
 class Policy:

@@ -15,7 +15,7 @@ from rich.panel import Panel
 from rich.table import Table
 
 from mjx_balance.evaluation.suites import HEADLINE
-from mjx_balance.files.text import printable
+from mjx_balance.text import printable
 
 PLAIN_INTERVAL = 5.0  #: seconds between two plain lines
 METRICS = {

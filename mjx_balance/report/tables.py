@@ -11,8 +11,8 @@ from rich.table import Table
 
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder
-from mjx_balance.files.text import PATH, shell, shorten
 from mjx_balance.robots.catalogue import shipped
+from mjx_balance.text import PATH, shell, shorten
 
 STATISTICS = ("mean", "p50", "p95", "p99", "max")  #: tilt statistics in the table of an evaluation
 

@@ -14,10 +14,10 @@ import mujoco
 import numpy as np
 
 from mjx_balance.errors import how_to_install
-from mjx_balance.files.text import MESSAGE, quote, shorten
 from mjx_balance.robots import urdf
 from mjx_balance.robots.robot import MOST
 from mjx_balance.robots.schema import RobotError
+from mjx_balance.text import MESSAGE, quote, shorten
 
 FRESH = mujoco.MjSpec()  #: MuJoCo's own defaults, for elements that we add to a maker's model
 REMOVED = (

@@ -12,9 +12,9 @@ from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.statistics import over_seeds
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import RunFolder, write_atomically, write_json
-from mjx_balance.files.text import MESSAGE, shorten
 from mjx_balance.policy.file import Policy, PolicyError, load_policy, save_policy
 from mjx_balance.report import tables
+from mjx_balance.text import MESSAGE, shorten
 from mjx_balance.training.loop import Run
 from mjx_balance.training.tensorboard import Board
 from mjx_balance.training.validation import Results, best_validated, exports, scalars, score

@@ -1,7 +1,6 @@
 """Makes text from outside safe to show: one short line without control characters.
 
-It imports no other module of ours, because the errors on the ground use it. `runtime.py`, one file
-for a robot, has a copy.
+`runtime.py`, one file for a robot, has a copy of `shorten`.
 """
 
 import os
