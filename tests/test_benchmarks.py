@@ -112,8 +112,6 @@ def load(name: str, monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_it_can_be_imported(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if script.stem in NEEDS:
-        pytest.importorskip(NEEDS[script.stem])
     load(script.stem, monkeypatch)
 
 
