@@ -159,15 +159,14 @@ def _stance(scene: Scene) -> str:
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.stance.qpos
     mujoco.mj_forward(scene.model, data)
-    com = data.subtree_com[scene.trunk]
     feet = np.asarray([data.geom(f"{ROBOT}{leg.foot}").xpos for leg in scene.robot.legs])
-    ahead, left = com[:2] - feet[:, :2].mean(axis=0)
-    around = feet[np.argsort(np.arctan2(*(feet[:, :2] - feet[:, :2].mean(axis=0)).T)), :2]
-    edges = np.roll(around, -1, axis=0) - around
-    across = np.stack((edges[:, 1], -edges[:, 0]), axis=-1)
-    across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    distance = np.abs(((com[:2] - around) * across).sum(axis=-1)).min()
-    height = com[2] - feet[:, 2].mean() + scene.robot.foot_radius
+    ahead, left, above = data.subtree_com[scene.trunk] - feet.mean(axis=0)
+    height = above + scene.robot.foot_radius
+    feet = feet[:, :2] - feet[:, :2].mean(axis=0)
+    starts = feet[np.argsort(np.arctan2(*feet.T))] - (ahead, left)  # of the edges, from the centre
+    ends = np.roll(starts, -1, axis=0)
+    areas = np.abs(np.linalg.det(np.stack((starts, ends), axis=1)))
+    distance = (areas / np.linalg.norm(ends - starts, axis=1)).min()
     tips = distance * math.sqrt(-scene.model.opt.gravity[2] / height)
     most = scale_ranges(SUITES["push"].randomization, scene.robot).push_max
     return (

@@ -93,7 +93,7 @@ def _sketch(model: str, path: Path, strip: Sequence[str]) -> tuple[str, list[str
     spec = read_model(path, strip=take_out).spec
     problems = []
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints):
-        root = max(spec.worldbody.bodies, key=_size, default=None)
+        root = max(spec.worldbody.bodies, key=lambda x: len(x.find_all("body")), default=None)
         if root is None:
             raise RobotError(f"{path.name} has no body")
         problems.append(
@@ -121,7 +121,7 @@ def _places(spec: mujoco.MjSpec) -> dict[str, float]:
         return {}
     qpos = list(next((key for key in keys if key.name == "home"), keys[0]).qpos)
     places, start = {}, 0
-    for joint in _depth_first(spec.worldbody):
+    for joint in spec.worldbody.find_all(mujoco.mjtObj.mjOBJ_JOINT):  # as they are compiled
         size = SIZES.get(joint.type, 1)
         if size == 1:
             places[joint.name] = start
@@ -129,17 +129,6 @@ def _places(spec: mujoco.MjSpec) -> dict[str, float]:
     if start != len(qpos):  # a keyframe need not say any
         return {}
     return {name: qpos[at] for name, at in places.items()}
-
-
-def _depth_first(body: mujoco.MjsBody) -> Iterator[mujoco.MjsJoint]:
-    """Joints of a body and of those below it, in the order of a compiled model."""
-    yield from body.joints
-    for child in body.bodies:
-        yield from _depth_first(child)
-
-
-def _size(body: mujoco.MjsBody) -> int:
-    return len(body.find_all(mujoco.mjtObj.mjOBJ_BODY))
 
 
 def _legs(
@@ -350,6 +339,6 @@ def _render(
                 problems.append(f"a joint of body {holder} has no name; {GIVE}")
         if leg and NAMELESS in leg.foot.text:
             problems.append(f"the body that holds the foot of leg {corner} has no name; {GIVE}")
-    mend = (MISSING[0], MISSING[1], _toml(NAMELESS))
+    mend = (*MISSING, _toml(NAMELESS))
     lines = [f"# {line}" if any(x in line for x in mend) else line for line in lines]
     return "\n".join(lines) + "\n"

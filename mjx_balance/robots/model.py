@@ -1,12 +1,13 @@
 """Finds, bounds, reads and mends a maker's model; nothing of it is run, and nothing imported."""
 
+import collections
 import contextlib
 import html
 import importlib.util
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -179,9 +180,12 @@ def naming(subject: str) -> Iterator[None]:
     except RobotError:
         raise
     except (ValueError, RuntimeError, mujoco.FatalError, MemoryError) as error:
-        message = _mujoco_message(error)
-        remedy = next((words for part, words in REMEDIES.items() if part in message), "")
-        raise RobotError(f"{subject}: {message}{remedy}") from error
+        # One line; MuJoCo's later lines name the element.
+        lines = (line.strip() for line in str(error).splitlines())
+        message = shorten("; ".join(line for line in lines if line), MESSAGE)
+        if "mass and inertia of moving bodies" in message:
+            message += "; write its mass and moments of inertia, or fix its joint by strip"
+        raise RobotError(f"{subject}: {message}") from error
     finally:
         mujoco.set_mju_user_warning(warn)
 
@@ -194,20 +198,6 @@ def compile_model(spec: mujoco.MjSpec, subject: str = "its model") -> mujoco.MjM
         if not (np.abs(getattr(model, field)) <= MOST).all():
             raise RobotError(f"{subject} has a {field} above {MOST:g}")
     return model
-
-
-REMEDIES = {
-    "mass and inertia of moving bodies": (
-        "; write its mass and moments of inertia, or fix its joint by strip"
-    ),
-}
-"""Remedies of errors, by a part of MuJoCo's message."""
-
-
-def _mujoco_message(error: Exception) -> str:
-    """MuJoCo's error message in one line; its later lines name the element."""
-    lines = (line.strip() for line in str(error).splitlines())
-    return shorten("; ".join(line for line in lines if line), MESSAGE)
 
 
 _TAG = re.compile(
@@ -234,41 +224,53 @@ def _check_text(path: Path) -> None:
                 raise RobotError(
                     f"{path.name} has {text.count(tag)} times {tag.decode()}; it may have {most}"
                 )
-        # MuJoCo hands an error's text to printf as its format: a name with %n ends the process.
-        plain = _without_comments(text).decode(errors="replace").encode()
-        for value in map(bytes.decode, _PERCENT.findall(plain)):
-            if "%" in html.unescape(value):
-                raise RobotError(f"{path.name} has an attribute {quote(value)}; it must have no %")
-        for tag, attributes in _TAG.findall(text):
-            pairs = _ATTRIBUTE.findall(html.unescape(attributes.decode(errors="replace")))
-            values = {name: first or second for name, first, second in pairs}
-            if tag in (b"include", b"model"):
-                places = {folder / values.get("file", "") for folder in (path.parent, file.parent)}
+        _check_percent(path, text)
+        for tag, values in _elements(text):
+            if tag in ("include", "model"):
+                places = {folder / values["file"] for folder in (path.parent, file.parent)}
                 files += [
                     x for x in places - {*files} if os.path.exists(x) and not os.path.isdir(x)
                 ]
-            elif tag == b"hfield":
-                points = math.prod(_integers(f"{values.get('nrow', 0)} {values.get('ncol', 0)}"))
+            elif tag == "hfield":
+                points = math.prod(_integers(f"{values['nrow'] or 0} {values['ncol'] or 0}"))
                 if points > MAX_PIXELS:
                     raise RobotError(
                         f"{path.name} has a height field of {points:.3g} points; it must have at "
                         f"most {MAX_PIXELS}"
                     )
-            elif tag == b"mesh":
-                made = [x for x in _integers(values.get("params", "")) if x > MAX_PARAMETER]
-                if "builtin" in values and made:
+            elif tag == "mesh":
+                made = max(_integers(values["params"]), default=0)
+                if values["builtin"] and made > MAX_PARAMETER:
                     raise RobotError(
-                        f"{path.name} has a mesh with parameter {made[0]:g}; it must be at most "
+                        f"{path.name} has a mesh with parameter {made:g}; it must be at most "
                         f"{MAX_PARAMETER}"
                     )
             else:
-                for count in _integers(values.get("count", "")):
-                    copies *= max(1, count)
+                copies *= math.prod(max(1, count) for count in _integers(values["count"]))
     if copies > MAX_COPIES:
         raise RobotError(
             f"{path.name} repeats elements up to {copies:.3g} times by replicate, composite or "
             f"flexcomp; at most {MAX_COPIES} times"
         )
+
+
+def _elements(text: bytes) -> Iterator[tuple[str, dict[str, str]]]:
+    """Elements of `_TAG` in a file, with their attributes; "" for those that they do not have."""
+    for tag, attributes in _TAG.findall(text):
+        pairs = _ATTRIBUTE.findall(html.unescape(attributes.decode(errors="replace")))
+        values = {name: first or second for name, first, second in pairs}
+        yield tag.decode(), collections.defaultdict(str, values)
+
+
+def _check_percent(path: Path, text: bytes) -> None:
+    """Checks that no attribute has a %.
+
+    MuJoCo hands an error's text to printf as its format: a name with %n ends the process.
+    """
+    plain = _without_comments(text).decode(errors="replace").encode()
+    for value in map(bytes.decode, _PERCENT.findall(plain)):
+        if "%" in html.unescape(value):
+            raise RobotError(f"{path.name} has an attribute {quote(value)}; it must have no %")
 
 
 def _without_comments(text: bytes) -> bytes:
@@ -307,7 +309,7 @@ def _couplings(spec: mujoco.MjSpec) -> list[Coupling]:
     """The active equality constraints between bodies, sites and joints."""
     couplings = []
     tendons = {x.name: x for x in spec.tendons}
-    for one in spec.equalities:
+    for one in [x for x in spec.equalities if x.active]:
         names = [name for name in (one.name1, one.name2) if name]
         if one.type == mujoco.mjtEq.mjEQ_TENDON:
             wraps = [x.target for name in names if name in tendons for x in tendons[name].path]
@@ -317,8 +319,7 @@ def _couplings(spec: mujoco.MjSpec) -> list[Coupling]:
         else:
             kind = "site" if one.objtype == mujoco.mjtObj.mjOBJ_SITE else "body"
             ends = [(kind, name) for name in names]
-        if one.active:
-            couplings.append(Coupling(one.type.name.removeprefix("mjEQ_").lower(), tuple(ends)))
+        couplings.append(Coupling(one.type.name.removeprefix("mjEQ_").lower(), tuple(ends)))
     return couplings
 
 
@@ -347,23 +348,22 @@ def _drop_unreadable(spec: mujoco.MjSpec) -> list[str]:
                 "body's <inertial>"
             )
         spec.delete(geom)
+    blank = [x for x in spec.textures if not _drawable(spec, x)]
+    lost = {
+        "STL, OBJ or MSH files": {mesh.file for mesh in gone.values()},
+        "textures": {file for texture in blank for file in _pictures(texture)},
+    }
     for mesh in gone.values():
         spec.delete(mesh)
-    blank = [x for x in spec.textures if not _drawable(spec, x)]
-    files = [file for x in blank for file in (x.file, *x.cubefiles) if file]
     for texture in blank:
         for material in spec.materials:
             material.textures = ["" if x == texture.name else x for x in material.textures]
         spec.delete(texture)
-    kinds = {
-        "STL, OBJ or MSH files": [mesh.file for mesh in gone.values()],
-        "textures": files,
-    }
     return [
         f"not shown, for they are no readable {kind}: "
-        f"{', '.join(sorted({Path(x).name for x in y}))}"
-        for kind, y in kinds.items()
-        if y
+        f"{', '.join(sorted({Path(x).name for x in files}))}"
+        for kind, files in lost.items()
+        if files
     ]
 
 
@@ -389,10 +389,15 @@ def _readable(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
     return 0 < faces <= MAX_FACES and path.stat().st_size == 84 + 50 * faces
 
 
+def _pictures(texture: mujoco.MjsTexture) -> list[str]:
+    """Files of a texture, which may have one for each side of a cube."""
+    return [name for name in (texture.file, *texture.cubefiles) if name]
+
+
 def _drawable(spec: mujoco.MjSpec, texture: mujoco.MjsTexture) -> bool:
     """Whether a texture's files exist, and it is small enough."""
     pixels = texture.width * texture.height
-    for name in filter(None, (texture.file, *texture.cubefiles)):
+    for name in _pictures(texture):
         path = _file(spec, texture, name)
         if not os.path.isfile(path):
             return False
@@ -412,7 +417,9 @@ def _weigh_links(spec: mujoco.MjSpec) -> list[str]:
         for geom in body.geoms:
             geom.mass = 0
     for body in light:
-        if body.joints and body.parent.name != "world" and _mass(_rigid(body)) == 0:
+        if not body.joints or body.parent.name == "world":
+            continue
+        if not any(x.mass for x in _rigid(body) if x.explicitinertial):
             raise RobotError(
                 f"link {quote(body.name)} moves, but neither it nor what is fixed to it has an "
                 "<inertial>; write its mass and moments of inertia"
@@ -431,8 +438,10 @@ def _rigid(body: mujoco.MjsBody) -> list[mujoco.MjsBody]:
     return fixed
 
 
-def _mass(bodies: Iterable[mujoco.MjsBody]) -> float:
-    return sum(body.mass for body in bodies if body.explicitinertial)
+def _inertia(body: mujoco.MjsBody) -> np.ndarray:
+    """Moments and products of inertia that a body says, (3, 3) kg m^2."""
+    full = body.fullinertia
+    return np.diag(body.inertia) if np.isnan(full[0]) else full[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
 
 
 def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
@@ -444,10 +453,7 @@ def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
     """
     mended = []
     for body in [x for x in spec.bodies[1:] if x.explicitinertial and not _possible(x)]:
-        full = body.fullinertia
-        matrix = np.diag(body.inertia)
-        if not np.isnan(full[0]):
-            matrix = np.asarray(full)[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+        matrix = _inertia(body)
         if not np.isfinite([body.mass, *matrix.ravel()]).all():
             raise RobotError(f"body {quote(body.name)} has an inertia that is not finite")
         moments, axes = np.linalg.eigh(matrix)
@@ -467,7 +473,7 @@ def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
                 f"sum of the others: {remedy}"
             )
         near = axes * nearest @ axes.T
-        if np.isnan(full[0]):
+        if np.isnan(body.fullinertia[0]):
             body.inertia = near.diagonal()
         else:
             body.fullinertia = [*near.diagonal(), near[0, 1], near[0, 2], near[1, 2]]
@@ -487,9 +493,7 @@ def _dense(spec: mujoco.MjSpec) -> list[str]:
     """
     dense = []
     for body in [x for x in spec.bodies[1:] if x.explicitinertial and x.mass > HEAVY]:
-        full = body.fullinertia
-        moments = sum(body.inertia if np.isnan(full[0]) else full[:3])
-        volume = 4 / 3 * np.pi * (5 / 6 * moments / body.mass) ** 1.5
+        volume = 4 / 3 * np.pi * (5 / 6 * _inertia(body).trace() / body.mass) ** 1.5
         if body.mass > MAX_DENSITY * volume:
             dense.append(f"{body.name} {body.mass:.3g} kg")
     if not dense:
@@ -501,10 +505,7 @@ def _possible(body: mujoco.MjsBody) -> bool:
     """Whether MuJoCo takes a body's inertia."""
     probe = mujoco.MjSpec()
     alone = probe.worldbody.add_body(mass=body.mass, explicitinertial=True)
-    if np.isnan(body.fullinertia[0]):
-        alone.inertia = body.inertia
-    else:
-        alone.fullinertia = body.fullinertia
+    alone.inertia, alone.fullinertia = body.inertia, body.fullinertia
     if len(_rigid(body)) == 1:  # only what moves must have a mass
         alone.add_freejoint()
     try:
