@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -10,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from fixtures import bodies
+from fixtures.bodies import inertial
 
 from mjx_balance.robots.build import Build, build
 from mjx_balance.robots.draft import draft, sketch
@@ -21,10 +23,31 @@ TOTAL = 15.2  #: mass of `bodies.urdf_text`, kg
 LEGS = {"FL": (0.2, 0.1), "FR": (0.2, -0.1), "RL": (-0.2, 0.1), "RR": (-0.2, -0.1)}
 
 
-def drafted(folder: Path, text: str, name: str = "model.urdf", visual: bool = False) -> Build:
+def written(folder: Path, model: str) -> Path:
+    """The file of a model, URDF or MJCF."""
+    path = folder / ("model.urdf" if "<robot" in model else "model.xml")
+    path.write_bytes(model.encode(errors="surrogateescape"))
+    return path
+
+
+def draft_of(folder: Path, model: str) -> str:
+    path = written(folder, model)
+    return draft(path.name, path)
+
+
+def sketch_of(folder: Path, model: str, strip: Sequence[str] = ()) -> tuple[str, list[str]]:
+    path = written(folder, model)
+    return sketch(path.name, path, strip)
+
+
+def built(folder: Path, file: str, visual: bool = False) -> Build:
+    """What a robot file builds."""
+    return build(parse_robot_file(file, folder / "drafted.toml"), visual)
+
+
+def drafted(folder: Path, model: str, visual: bool = False) -> Build:
     """What the draft of a model builds."""
-    (folder / name).write_text(text)
-    return build(parse_robot_file(draft(name, folder / name), folder / "drafted.toml"), visual)
+    return built(folder, draft_of(folder, model), visual)
 
 
 def urdf(edits: Edits = [], root: str = "trunk") -> str:  # noqa: B006
@@ -51,13 +74,11 @@ def with_constraint(model: str, constraint: str) -> str:
 
 
 BOX = '<collision><geometry><box size="0.4 0.3 0.1"/></geometry></collision>'
-FEET = [(f'name="{leg}_tip"><inertial>', f'name="{leg}_tip"><later>') for leg in bodies.LEGS]
+EYE = '<body name="eye"><joint name="eye" type="ball"/><geom size=".02" mass=".1"/></body>'
 
 
 def without_inertial(link: str, mass: float) -> tuple[str, str]:
-    same = " ".join(f'{i}="{0.01 * (i[1] == i[2])}"' for i in bodies.INERTIA)
-    inertial = f'<inertial><mass value="{mass}"/><inertia {same}/></inertial>'
-    return f'<link name="{link}">{inertial}', f'<link name="{link}">'
+    return f'<link name="{link}">{inertial(mass)}', f'<link name="{link}">'
 
 
 def fixed(name: str, parent: str, content: str) -> tuple[str, str]:
@@ -100,10 +121,10 @@ def test_a_link_that_moves_needs_a_mass(tmp_path: Path) -> None:
 
 def test_what_is_weighed_by_volume_is_said(tmp_path: Path) -> None:
     """An MJCF box of 0.4 x 0.2 x 0.1 m without a mass weighs 8 kg there."""
-    got = drafted(tmp_path, walker().replace(' mass="5"', ""), "model.xml")
+    got = drafted(tmp_path, walker().replace(' mass="5"', ""))
     assert got.robot.trunk_mass == pytest.approx(8.0)
     assert got.notes[0] == "weighed by the volume of their geoms: trunk"
-    assert drafted(tmp_path, walker(), "model.xml").notes == []
+    assert drafted(tmp_path, walker()).notes == []
 
 
 HEXAPOD = LEGS | {"ML": (0.0, 0.1), "MR": (0.0, -0.1)}
@@ -111,16 +132,15 @@ HEXAPOD = LEGS | {"ML": (0.0, 0.1), "MR": (0.0, -0.1)}
 
 def test_six_legs_are_not_four(tmp_path: Path) -> None:
     """But are, if the file leaves two of them out."""
-    (tmp_path / "model.xml").write_text(walker(HEXAPOD))
     with pytest.raises(RobotError, match=r"6 chains that could be legs .*: leave .* --strip NAME"):
-        draft("model.xml", tmp_path / "model.xml")
-    text, _ = sketch("model.xml", tmp_path / "model.xml")
+        draft_of(tmp_path, walker(HEXAPOD))
+    text, _ = sketch_of(tmp_path, walker(HEXAPOD))
     assert "# To mend: model.xml has 6 chains" in text
     with pytest.raises(RobotError, match="is in no leg"):
-        build(parse_robot_file(text, tmp_path / "drafted.toml"))
-    text, problems = sketch("model.xml", tmp_path / "model.xml", ["ML_hip", "MR_hip"])
+        built(tmp_path, text)
+    text, problems = sketch_of(tmp_path, walker(HEXAPOD), ["ML_hip", "MR_hip"])
     assert problems == []
-    robot = build(parse_robot_file(text, tmp_path / "drafted.toml")).robot
+    robot = built(tmp_path, text).robot
     assert robot.total_mass == pytest.approx(9)
     assert [leg.name for leg in robot.legs] == list(LEGS)
 
@@ -135,8 +155,7 @@ def test_an_arm_is_a_leg_where_it_reaches_the_floor(
         '<geom size=".02" mass=".1"/>'
         for k, axis in enumerate(("1 0 0", "0 1 0", "0 1 0"))
     )
-    (tmp_path / "model.xml").write_text(walker(more=arm + "</body>" * 3))
-    text, problems = sketch("model.xml", tmp_path / "model.xml")
+    text, problems = sketch_of(tmp_path, walker(more=arm + "</body>" * 3))
     assert bool(problems) == refused
     assert 'strip = ["arm0", "arm1", "arm2"]' in text
 
@@ -165,9 +184,9 @@ def test_a_leg_whose_joints_are_coupled_is_refused(kind: str, tmp_path: Path) ->
     """Ours would move as the maker's cannot."""
     constraint, message = CONSTRAINTS[kind]
     with pytest.raises(RobotError, match=message):
-        drafted(tmp_path, with_constraint(walker(), constraint), "model.xml")
+        drafted(tmp_path, with_constraint(walker(), constraint))
     inactive = constraint.replace("/>", ' active="false"/>', 1)
-    assert drafted(tmp_path, with_constraint(walker(), inactive), "model.xml").notes == []
+    assert drafted(tmp_path, with_constraint(walker(), inactive)).notes == []
 
 
 def test_a_urdfs_mimic_is_a_coupling(tmp_path: Path) -> None:
@@ -180,23 +199,20 @@ def test_a_urdfs_mimic_is_a_coupling(tmp_path: Path) -> None:
 def test_rods_that_close_a_linkage(tmp_path: Path) -> None:
     """Their knees are driven directly where the rods are left out; the draft says how."""
     rods = "".join(f'<connect body1="{x}_rod" body2="{x}_calf" anchor="-.04 0 -.2"/>' for x in LEGS)
-    (tmp_path / "model.xml").write_text(with_constraint(walker(shank=ROD), rods))
-    with pytest.raises(
-        RobotError, match="a limb of FL_abduction, FL_flexion, FL_lever, FL_knee; f"
-    ):
-        draft("model.xml", tmp_path / "model.xml")
-    text, problems = sketch("model.xml", tmp_path / "model.xml", [f"{leg}_rod" for leg in LEGS])
-    got = build(parse_robot_file(text, tmp_path / "drafted.toml"))
-    assert (problems, got.notes) == ([], [])
-    text, _ = sketch("model.xml", tmp_path / "model.xml", [f"{leg}_lever" for leg in LEGS])
+    model = with_constraint(walker(shank=ROD), rods)
+    with pytest.raises(RobotError, match="limb of FL_abduction, FL_flexion, FL_lever, FL_knee; f"):
+        draft_of(tmp_path, model)
+    text, problems = sketch_of(tmp_path, model, [f"{leg}_rod" for leg in LEGS])
+    assert (problems, built(tmp_path, text).notes) == ([], [])
+    text, _ = sketch_of(tmp_path, model, [f"{leg}_lever" for leg in LEGS])
     with pytest.raises(RobotError, match=r"'FL_rod' and 'FL_calf' couples .* strip the rods that"):
-        build(parse_robot_file(text, tmp_path / "drafted.toml"))
+        built(tmp_path, text)
 
 
 def test_a_constraint_elsewhere_is_left_out_and_said(tmp_path: Path) -> None:
     load = '<body name="load"><geom size=".02" mass=".1"/></body>'
     text = with_constraint(walker(more=load), '<weld body1="load" body2="trunk"/>')
-    notes = drafted(tmp_path, text, "model.xml").notes
+    notes = drafted(tmp_path, text).notes
     assert notes[0] == "the weld constraint of 'load' and 'trunk' is left out"
 
 
@@ -248,8 +264,8 @@ def test_a_mesh_that_cannot_be_read_stops_nothing(file: str, tmp_path: Path) -> 
     (tmp_path / "trunk.dae").write_text("<COLLADA/>")
     (tmp_path / "ascii.stl").write_text("solid trunk\n" + "facet normal 0 0 1\n" * 20)
     stl(tmp_path / "lies.stl", faces=5)
-    inertial = '<link name="trunk"><inertial>'
-    text = urdf([(inertial, inertial.replace("<i", f"{mesh(file)}{mesh(file, 'collision')}<i"))])
+    trunk = '<link name="trunk">'
+    text = urdf([(trunk, f"{trunk}{mesh(file)}{mesh(file, 'collision')}")])
     got = drafted(tmp_path, text, visual=True)
     assert got.robot.total_mass == pytest.approx(TOTAL)
     assert got.notes[0].endswith(f"no readable STL, OBJ or MSH files: {Path(file).name}")
@@ -272,12 +288,12 @@ def test_pictures_that_are_missing_stop_nothing(tmp_path: Path) -> None:
     file="skin.png"/><material name="skin" texture="skin"/></asset><worldbody>"""
     text = walker(more='<geom type="mesh" mesh="hull" mass="0" contype="0" conaffinity="0"/>')
     text = text.replace("<worldbody>", assets).replace('mass="5"', 'mass="5" material="skin"')
-    got = drafted(tmp_path, text, "model.xml", visual=True)
+    got = drafted(tmp_path, text, visual=True)
     assert got.notes[0].endswith("files: hull.stl")
     assert got.notes[1].endswith("no readable textures: skin.png")
     assert got.spec.compile().ntex == 0
     with pytest.raises(RobotError, match=r"mesh 'hull.stl', by which body 'trunk' is weighed"):
-        drafted(tmp_path, text.replace('mesh="hull" mass="0"', 'mesh="hull"'), "model.xml")
+        drafted(tmp_path, text.replace('mesh="hull" mass="0"', 'mesh="hull"'))
 
 
 def test_paths_of_assets_are_stripped_where_the_model_says(tmp_path: Path) -> None:
@@ -289,7 +305,7 @@ def test_paths_of_assets_are_stripped_where_the_model_says(tmp_path: Path) -> No
     <material name="skin" texture="skin"/></asset><worldbody>"""
     more = '<geom type="mesh" mesh="hull" material="skin" contype="0" conaffinity="0"/>'
     text = walker(more=more).replace("<worldbody>", assets)
-    shown = drafted(tmp_path, text, "model.xml", visual=True).spec.compile()
+    shown = drafted(tmp_path, text, visual=True).spec.compile()
     assert (shown.nmesh, shown.ntex) == (1, 1)
 
 
@@ -303,12 +319,12 @@ def test_a_texture_of_six_files_is_shown(tmp_path: Path) -> None:
     assets = f"""<compiler texturedir="textures"/><asset><texture name="skin" type="cube" {files}/>
     <material name="skin" texture="skin"/></asset><worldbody>"""
     text = walker().replace("<worldbody>", assets).replace('mass="5"', 'mass="5" material="skin"')
-    assert drafted(tmp_path, text, "model.xml", visual=True).spec.compile().ntex == 1
+    assert drafted(tmp_path, text, visual=True).spec.compile().ntex == 1
     bomb = tmp_path / "textures" / "up.png"
     head = bytearray(bomb.read_bytes())
     head[16:24] = (100_000).to_bytes(4) * 2
     bomb.write_bytes(head)
-    assert drafted(tmp_path, text, "model.xml", visual=True).spec.compile().ntex == 0
+    assert drafted(tmp_path, text, visual=True).spec.compile().ntex == 0
 
 
 @pytest.mark.parametrize(
@@ -330,13 +346,6 @@ def test_urdfs_as_they_are_written(
     else:
         with pytest.raises(RobotError, match=message):
             drafted(tmp_path, text)
-
-
-def inertial(mass: float, *moments: float) -> str:
-    """An inertial with ixx, iyy, izz, ixy, ixz, iyz."""
-    values = zip(bodies.INERTIA, (*moments, 0, 0, 0), strict=False)
-    words = " ".join(f'{name}="{x}"' for name, x in values)
-    return f'<inertial><mass value="{mass}"/><inertia {words}/></inertial>'
 
 
 MENDED = {
@@ -365,8 +374,7 @@ def test_the_nearest_inertia(tmp_path: Path) -> None:
     Without it they are 2 + 0, 3 + 0 and 3 + 2 (and 1% of the greatest, for a body has a thickness).
     """
     text = urdf([fixed("lid", "trunk", inertial(0.1, 1e-3, 2e-3, 5e-3))])
-    (tmp_path / "model.urdf").write_text(text)
-    lid = read_model(tmp_path / "model.urdf").spec.body("lid")
+    lid = read_model(written(tmp_path, text)).spec.body("lid")
     np.testing.assert_allclose(lid.fullinertia[:3], (2e-3, 3e-3, 5e-3), atol=4e-5)
     np.testing.assert_allclose(lid.fullinertia[3:], 0, atol=1e-12)
 
@@ -379,10 +387,7 @@ def test_a_link_that_moves_is_mended_if_it_misses_by_little(
     moments: tuple[float, ...], mended: bool, tmp_path: Path
 ) -> None:
     """Its third moment is the sum of the others and 2% more; 50% more is no rounding."""
-    same = " ".join(f'{i}="{0.01 * (i[1] == i[2])}"' for i in bodies.INERTIA)
-    old = f'<mass value="1.15"/><inertia {same}/>'
-    new = inertial(1.15, *moments).removeprefix("<inertial>").removesuffix("</inertial>")
-    text = urdf([(old, new)])
+    text = urdf([(inertial(1.15), inertial(1.15, *moments))])
     if mended:
         assert drafted(tmp_path, text).notes[0].endswith("by the nearest: LF_thigh")
     else:
@@ -408,7 +413,7 @@ REFUSED: dict[str, tuple[str, list[str], str]] = {
     "an arm that is not finite": (
         urdf([hinged("arm", "trunk", inertial(0.5, 1e-3, np.inf, 1e-3))]),
         ["arm"],
-        "'arm'|'to_arm'|not finite",
+        "'arm' has an inertia that is not finite",
     ),
     "a mesh that is lost": (
         walker(more='<body name="arm"><geom type="mesh" mesh="a"/></body>').replace(
@@ -423,14 +428,11 @@ REFUSED: dict[str, tuple[str, list[str], str]] = {
 @pytest.mark.parametrize("kind", REFUSED)
 def test_what_is_stripped_need_not_be_right(kind: str, tmp_path: Path) -> None:
     text, strip, message = REFUSED[kind]
-    path = tmp_path / ("model.xml" if "<mujoco>" in text else "model.urdf")
-    path.write_text(text)
     with pytest.raises(RobotError, match=message):
-        draft(path.name, path)
-    text, problems = sketch(path.name, path, strip)
+        draft_of(tmp_path, text)
+    file, problems = sketch_of(tmp_path, text, strip)
     assert problems == []
-    robot = build(parse_robot_file(text, tmp_path / "drafted.toml")).robot
-    assert robot.total_mass == pytest.approx(9 if path.suffix == ".xml" else TOTAL)
+    assert built(tmp_path, file).robot.total_mass == pytest.approx(TOTAL if "<robot" in text else 9)
 
 
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
@@ -438,10 +440,8 @@ def test_a_mass_of_the_whole_is_shared_before_bodies_are_stripped(tmp_path: Path
     """Of 20 kg for masses of 9 + 1, the robot keeps 18."""
     arm = '<body name="arm"><geom size=".02" mass="1"/></body>'
     text = walker(more=arm).replace("<compiler ", '<compiler settotalmass="20" ')
-    (tmp_path / "model.xml").write_text(text)
-    text, _ = sketch("model.xml", tmp_path / "model.xml", ["arm"])
-    robot = build(parse_robot_file(text, tmp_path / "drafted.toml")).robot
-    assert robot.total_mass == pytest.approx(18)
+    file, _ = sketch_of(tmp_path, text, ["arm"])
+    assert built(tmp_path, file).robot.total_mass == pytest.approx(18)
 
 
 @pytest.mark.parametrize("base", ["world", "base", "odom"])
@@ -466,9 +466,10 @@ def test_a_percent_in_a_comment_is_no_harm(head: str, tmp_path: Path) -> None:
     """In any number of them, and beside a name that looks like the begin of one."""
     comment = '<!-- kp="80%" <joint name="%n"/> --><site name="a&lt;!--"/><!-- friction=\'5 %\' -->'
     text = head + walker().replace("<freejoint/>", f"<freejoint/>{comment}")
-    assert drafted(tmp_path, text, "model.xml").robot.total_mass == pytest.approx(9)
+    assert drafted(tmp_path, text).robot.total_mass == pytest.approx(9)
 
 
+PERCENT = "has an attribute .*; it must have no %"
 HUGE = {
     # content of the model, or of its trunk; message
     "ground": (
@@ -490,21 +491,12 @@ HUGE = {
     "name": ('<site name="a\udcff"/>', "has a name among its sites that is not UTF-8"),
     "pipe": ('<include file="pipe"/>', "includes '.*pipe', which is no regular file"),
     "megabytes": (f"<!--{'x' * 2**24}-->", "has more than 16 MiB of XML"),
-    "format": ('<site class="%s%n"/>', "has an attribute .*; it must have no %"),
-    "format after what is no comment": (
-        '<site class="<!--"/><site class="%s%n"/><!-- -->',
-        "has an attribute .*; it must have no %",
-    ),
-    "format in a quote": (
-        "<site name='\"' class='<!--'/><site class='%n'/><!-- -->",
-        "has an attribute .*; it must have no %",
-    ),
-    "format after other marks": (
-        '<![CDATA[ > <!-- ]]><site class="%n"/><!-- -->',
-        "has an attribute .*; it must have no %",
-    ),
-    "hidden format": ("<site class='&#37;n'/>", "has an attribute .*; it must have no %"),
-    "plugin": ('<plugin plugin="mujoco.elasticity.cable"/>', "plugin|cannot be read"),
+    "format": ('<site class="%s%n"/>', PERCENT),
+    "format after no comment": ('<site class="<!--"/><site class="%n"/><!-- -->', PERCENT),
+    "format in a quote": ("<site name='\"' class='<!--'/><site class='%n'/><!-- -->", PERCENT),
+    "format after other marks": ('<![CDATA[ > <!-- ]]><site class="%n"/><!-- -->', PERCENT),
+    "hidden format": ("<site class='&#37;n'/>", PERCENT),
+    "plugin": ('<plugin plugin="mujoco.elasticity.cable"/>', "needs a plugin of MuJoCo, which"),
 }
 
 
@@ -515,35 +507,38 @@ def test_a_model_that_would_take_the_machine_is_refused(kind: str, tmp_path: Pat
     place = "</mujoco>" if content.startswith("<asset") else "<freejoint/>"
     text = walker().replace(place, content + place)
     os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "model.xml").write_bytes(text.encode(errors="surrogateescape"))
     start = time.process_time()
     with pytest.raises(RobotError, match=message) as caught:
-        draft("model.xml", tmp_path / "model.xml")
+        draft_of(tmp_path, text)
     assert time.process_time() - start < 3
     assert len(str(caught.value)) <= 300
     assert str(caught.value).isprintable()
 
 
+LOTS = "".join(f'<!ENTITY x{k} "{f"&x{k - 1};" * 10}">' for k in range(1, 9))
+
+
 @pytest.mark.parametrize(
-    "content",
+    ("head", "content", "message"),
     [
-        "<a>" * 5000 + "</a>" * 5000,
-        "<a>&lots;</a>",
+        ("", "<a>" * 5000 + "</a>" * 5000, "nested too deep"),
+        (f'<!DOCTYPE robot [<!ENTITY x0 "x">{LOTS}]>', "<a>&x8;</a>", "cannot be read: limit"),
     ],
     ids=["nested", "entities"],
 )
-def test_xml_that_would_take_the_machine(content: str, tmp_path: Path) -> None:
-    text = urdf([("</robot>", f"{content}</robot>")])
-    with pytest.raises(RobotError, match=r"model.urdf"):
-        drafted(tmp_path, text)
+def test_xml_that_would_take_the_machine(
+    head: str, content: str, message: str, tmp_path: Path
+) -> None:
+    """Elements in elements, or a short line that stands for 100 MB."""
+    with pytest.raises(RobotError, match=message):
+        drafted(tmp_path, head + urdf([("</robot>", f"{content}</robot>")]))
 
 
 def test_nothing_is_written_beside_a_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """MuJoCo warns of NaN in a log file."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "model.xml").write_text(walker().replace('size=".2 .1 .05"', 'size=".2 .1 nan"'))
     with pytest.raises(RobotError, match=r"model.xml"):
-        draft("model.xml", tmp_path / "model.xml")
+        draft_of(tmp_path, walker().replace('size=".2 .1 .05"', 'size=".2 .1 nan"'))
     assert [path.name for path in tmp_path.iterdir()] == ["model.xml"]
 
 
@@ -565,7 +560,7 @@ LARGE = {
 def test_what_is_not_the_robots_takes_no_memory(kind: str, tmp_path: Path) -> None:
     text = walker().replace("</mujoco>", f"{LARGE[kind]}</mujoco>")
     start = time.process_time()
-    assert drafted(tmp_path, text, "model.xml").robot.total_mass == pytest.approx(9)
+    assert drafted(tmp_path, text).robot.total_mass == pytest.approx(9)
     assert time.process_time() - start < 3
 
 
@@ -576,24 +571,21 @@ axis="0 3 1" pos="0 0 .05" ref=".4"/><geom size=".02" pos="0 .1 .2" mass=".5"/><
 
 def test_an_arm_is_fixed_where_the_file_says(tmp_path: Path) -> None:
     """Every mass is where MuJoCo's kinematics of the whole model put it."""
-    (tmp_path / "model.xml").write_text(walker(more=ARM))
-    whole = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    whole = mujoco.MjModel.from_xml_string(walker(more=ARM))
     data = mujoco.MjData(whole)
     data.qpos[:3], data.qpos[whole.joint("lift").qposadr[0]] = 0, -0.05
     data.qpos[whole.joint("shoulder").qposadr[0]] = 1.7
     mujoco.mj_forward(whole, data)
-    text = draft("model.xml", tmp_path / "model.xml")
+    text = draft_of(tmp_path, walker(more=ARM))
     assert 'strip = ["lift", "shoulder"]' in text
     places = '{ joint = "lift", at = -0.05 }, { joint = "shoulder", at = 1.7 }'
-    text = text.replace('"lift", "shoulder"', places)
-    fixed = build(parse_robot_file(text, tmp_path / "drafted.toml")).spec.compile()
+    fixed = built(tmp_path, text.replace('"lift", "shoulder"', places)).spec.compile()
     posed = mujoco.MjData(fixed)
     mujoco.mj_forward(fixed, posed)
     np.testing.assert_allclose(posed.body("trunk").subtree_com, data.body("trunk").subtree_com)
-    first = data.body("trunk").xipos * 0
-    for name in ("trunk", "lift", "arm"):
-        first += data.body(name).xipos * whole.body(name).mass[0] / 5.8
-    np.testing.assert_allclose(posed.body("trunk").xipos, first, atol=1e-12)
+    parts = [whole.body(name).id for name in ("trunk", "lift", "arm")]
+    centre = np.average(data.xipos[parts], axis=0, weights=whole.body_mass[parts])
+    np.testing.assert_allclose(posed.body("trunk").xipos, centre, atol=1e-12)
 
 
 def test_a_draft_fixes_joints_where_the_keyframe_has_them(tmp_path: Path) -> None:
@@ -603,45 +595,38 @@ def test_a_draft_fixes_joints_where_the_keyframe_has_them(tmp_path: Path) -> Non
         f'<key name="{name}" qpos="0 0 .3 1 0 0 0 {arm} {legs}"/>'
         for name, arm in (("up", "0 0"), ("home", ".1 -1.25"))
     )
-    text = walker(more=ARM).replace("</mujoco>", f"<keyframe>{keys}</keyframe></mujoco>")
-    (tmp_path / "model.xml").write_text(text)
-    drafted = draft("model.xml", tmp_path / "model.xml")
-    assert 'strip = ["lift", { joint = "shoulder", at = -1.25 }]' in drafted
-    (tmp_path / "model.xml").write_text(text.replace('name="home"', 'name="a"'))
-    drafted = draft("model.xml", tmp_path / "model.xml")
-    assert 'strip = [{ joint = "lift", at = 0 }, { joint = "shoulder", at = 0 }]' in drafted
+    model = walker(more=ARM).replace("</mujoco>", f"<keyframe>{keys}</keyframe></mujoco>")
+    at_home = 'strip = ["lift", { joint = "shoulder", at = -1.25 }]'
+    assert at_home in draft_of(tmp_path, model)
+    at_first = 'strip = [{ joint = "lift", at = 0 }, { joint = "shoulder", at = 0 }]'
+    assert at_first in draft_of(tmp_path, model.replace('name="home"', 'name="a"'))
 
 
 @pytest.mark.parametrize("strip", ["lift", "arm", "shoulder", "eye"])
 def test_a_draft_strips_a_model_with_a_keyframe(strip: str, tmp_path: Path) -> None:
     """Whatever it strips, what is left is fixed where the keyframe of the whole has it."""
-    eye = '<body name="eye"><joint name="eye" type="ball"/><geom size=".02" mass=".1"/></body>'
-    model = walker(more=f"{eye}{ARM}")
-    (tmp_path / "model.xml").write_text(model)
-    whole = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    model = walker(more=f"{EYE}{ARM}")
+    whole = mujoco.MjModel.from_xml_string(model)
     qpos = whole.qpos0.copy()
     at = {"lift": 0.25, "shoulder": -1.25}
     for name, value in at.items():
         qpos[whole.joint(name).qposadr] = value
     numbers = " ".join(map(str, qpos))
     key = f'<keyframe><key name="home" qpos="{numbers}"/></keyframe>'
-    (tmp_path / "model.xml").write_text(model.replace("</mujoco>", f"{key}</mujoco>"))
-    text, problems = sketch("model.xml", tmp_path / "model.xml", [strip])
+    text, problems = sketch_of(tmp_path, model.replace("</mujoco>", f"{key}</mujoco>"), [strip])
     assert problems == []
     gone = {"lift": ("lift", "arm", "shoulder"), "arm": ("arm", "shoulder")}.get(strip, (strip,))
     for name, value in at.items():
         assert (f'{{ joint = "{name}", at = {value} }}' in text) == (name not in gone)
     assert (', "eye"' in text) == (strip != "eye")
-    build(parse_robot_file(text, tmp_path / "drafted.toml"))
+    built(tmp_path, text)
 
 
 def test_a_ball_is_fixed_nowhere_else(tmp_path: Path) -> None:
-    ball = '<body name="eye"><joint name="eye" type="ball"/><geom size=".02" mass=".1"/></body>'
-    (tmp_path / "model.xml").write_text(walker(more=ball))
-    text = draft("model.xml", tmp_path / "model.xml")
+    text = draft_of(tmp_path, walker(more=EYE))
     text = text.replace('strip = ["eye"]', 'strip = [{ joint = "eye", at = 1.0 }]')
     with pytest.raises(RobotError, match="strip fixes 'eye' at 1; it is no hinge or slide"):
-        build(parse_robot_file(text, tmp_path / "drafted.toml"))
+        built(tmp_path, text)
 
 
 def test_a_robot_without_shapes_is_a_stick_figure(tmp_path: Path) -> None:
@@ -664,8 +649,7 @@ def test_small_feet_of_small_calves(tmp_path: Path) -> None:
     )
     tips = [(f"{x}-0.213", f"{x}-0.05") for x in map(fixed.format, bodies.LEGS)]
     balls = [('<sphere radius="0.022"/>', '<box size="0.001 0.001 0.001"/>')] * 4
-    (tmp_path / "model.urdf").write_text(urdf(tips + balls))
-    assert "foot_radius = 0.0063" in draft("model.urdf", tmp_path / "model.urdf")
+    assert "foot_radius = 0.0063" in draft_of(tmp_path, urdf(tips + balls))
 
 
 def test_a_mass_that_no_body_of_its_size_has(tmp_path: Path) -> None:
@@ -680,11 +664,8 @@ def test_a_mass_that_no_body_of_its_size_has(tmp_path: Path) -> None:
     [
         ([('name="LF_knee"', 'name="LF_hip"')], "repeated name 'LF_hip' in joint"),
         ([('xyz="0 0 -0.213"', 'xyz="0 0 -1e308"')], "a body_pos above 1e"),
-        ([('xyz="0 0 -0.213"', 'xyz="0 nan 0"')], r"model.urdf"),
-        (
-            [('<mass value="6.92"/>', '<mass value="inf"/>')],
-            "has a body_mass above 1e",
-        ),
+        ([('xyz="0 0 -0.213"', 'xyz="0 nan 0"')], "a body_pos above 1e"),
+        ([('<mass value="6.92"/>', '<mass value="inf"/>')], "has a body_mass above 1e"),
     ],
 )
 def test_broken_models_end_in_a_sentence(edits: Edits, message: str, tmp_path: Path) -> None:
