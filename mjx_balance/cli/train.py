@@ -54,7 +54,8 @@ def sweep(argv: list[str]) -> int:
     entries = []
     for text in argv[:count]:
         try:
-            entries += _read(text[1:]).split() if text.startswith("@") else [text]
+            file = Path(text[1:])
+            entries += file.read_text("utf-8-sig").split() if text.startswith("@") else [text]
         except (OSError, UnicodeDecodeError) as error:
             return complain(f"the values in {text[1:]} cannot be read: {error}")
     if not entries and not {"--resume", *HELP} & set(argv):
@@ -62,10 +63,6 @@ def sweep(argv: list[str]) -> int:
             "say what to try, as gamma=0.1,0.4, or @FILE with such entries, before train's flags"
         )
     return train([*argv[count:], *(["--sweep", *entries] if entries else [])])
-
-
-def _read(name: str) -> str:
-    return Path(name).read_text(encoding="utf-8-sig")
 
 
 def train(argv: list[str]) -> int:

@@ -12,7 +12,6 @@ from mjx_balance.config.schema import Config, ConfigError
 from mjx_balance.config.validation import check
 from mjx_balance.files.run_folder import RunFolderError, read_json, unfinished_run
 from mjx_balance.files.validation import parse
-from mjx_balance.text import MESSAGE, shorten
 
 T = TypeVar("T")
 
@@ -57,14 +56,14 @@ def read_run_config(path: Path) -> Config:
     try:
         config = read_config(folder.config)
     except ValueError as error:
-        reason = shorten(error, MESSAGE)
-        raise RunFolderError(f"{folder.config} cannot be used: {reason}") from error
+        raise RunFolderError(f"{folder.config} cannot be used: {error}") from error
     if _is_file(config.robot):
-        with contextlib.suppress(ValueError, LookupError, TypeError):  # `check_same_provenance`
-            began_with = read_json(folder.provenance)["robot_file"]
-            if isinstance(began_with, str) and os.path.isfile(began_with):
-                here = os.path.isfile(config.robot) and os.path.samefile(config.robot, began_with)
-                return config if here else dataclasses.replace(config, robot=began_with)
+        with contextlib.suppress(ValueError, LookupError, TypeError):
+            # Whatever is wrong with the provenance, `check_same_provenance` says it.
+            began_with = str(Path(read_json(folder.provenance)["robot_file"]))
+            same = os.path.realpath(config.robot) == os.path.realpath(began_with)
+            if os.path.isfile(began_with) and not same:
+                return dataclasses.replace(config, robot=began_with)
     return config
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mjx_balance.errors import InputError
-from mjx_balance.text import MESSAGE, PATH, shell, shorten
+from mjx_balance.text import PATH, shell, shorten
 
 if sys.platform == "win32":
     import msvcrt
@@ -154,7 +154,7 @@ def check_contained(path: Path) -> RunFolder:
     """
     folder, root = RunFolder(path), os.path.realpath(path)
     entries = [str(entry) for entry in vars(folder).values() if entry != path]
-    entries, known = [entry for entry in entries if os.path.lexists(entry)], set()
+    known: set[str] = set()
     while entries:
         entry = entries.pop()
         try:
@@ -177,8 +177,9 @@ def check_contained(path: Path) -> RunFolder:
                     f"{shorten(entry, PLACE)} is neither a file nor a folder; remove it"
                 )
         except OSError as error:
-            if isinstance(error, FileNotFoundError) and not os.path.lexists(entry):
-                continue  # a run that goes on has renamed it
+            gone = isinstance(error, FileNotFoundError | NotADirectoryError)
+            if gone and not os.path.lexists(entry):
+                continue  # never there, or renamed by a run that goes on
             raise RunFolderError(
                 f"{shorten(entry, PLACE)} cannot be read: {error.strerror}"
             ) from error
@@ -258,7 +259,7 @@ def check_same_provenance(path: Path, today: Mapping[str, Any]) -> str | None:
         versions = dict(saved["versions"])
     except (LookupError, TypeError, ValueError) as error:
         raise RunFolderError(
-            f"{file} cannot be used: {shorten(error, MESSAGE)}; start a new run with --run-dir"
+            f"{file} cannot be used: {error}; start a new run with --run-dir"
         ) from error
     for name, value in today.items():
         if name != "versions" and saved.get(name) != value:

@@ -13,12 +13,8 @@ import safetensors.numpy
 from mjx_balance.files.run_folder import RunFolder, write_atomically
 from mjx_balance.policy.manifest import PolicyError, naming, upgrade
 from mjx_balance.policy.network import Policy
+from mjx_balance.runtime import MOST_BYTES, MOST_HEADER, MOST_MANIFEST, MOST_WEIGHTS
 from mjx_balance.text import quote
-
-MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
-MOST_HEADER = 8 * 2**20  #: greatest size of its header
-MOST_MANIFEST = 4 * 2**20  #: greatest size of a manifest, characters
-MOST_WEIGHTS = 1_000
 
 
 def flat_weights(params: Mapping[str, Any]) -> dict[str, np.ndarray]:

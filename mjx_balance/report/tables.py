@@ -86,7 +86,7 @@ def print_summary(
     run_dir: Path,
     results: dict[str, dict[str, Any]],
     seconds: float,
-    robot: str = "quadruped",
+    robot: str,
 ) -> None:
     """Prints a run's results, JSON of `summarize` by suite, its files and the seconds it took.
 

@@ -461,7 +461,7 @@ def test_a_folders_name_reaches_the_terminal_as_text(capsys: pytest.CaptureFixtu
     for command in ("evaluate", "report", "view"):
         assert main([command, str(folder)]) == 2
     assert main(["report", str(folder), "--out", str(folder / "none" / "page.html")]) == 2
-    print_summary(Console(), folder, {}, 1.0)
+    print_summary(Console(), folder, {}, 1.0, "quadruped")
     Display(Console()).say(f"{folder}: preset default")
     said = capsys.readouterr()
     assert_safe(said.out + said.err)

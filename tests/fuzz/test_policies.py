@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.hostile import change
 from fixtures.policies import HEADS, random_policy, with_head
 
 from mjx_balance.config import Config
@@ -19,8 +20,6 @@ from mjx_balance.runtime import Controller, PolicyFileError
 
 pytestmark = pytest.mark.slow
 
-NUMBERS = (0, -1, 1, 2**31, 2**63, 10**400, 0.5, -0.0, 1e-320, 1e308, float("nan"), float("inf"))
-TEXTS = ("", "x" * 100_000, "\x1b[2J\x07", "\ud800", "\u202e", "../../p", "a\0b", "__class__")
 SECONDS = 5.0  #: of computing; a sentence comes within one, and the machine may be busy
 Parts = tuple[dict[str, Any], dict[str, Any], bytes]  #: header, manifest, numbers
 
@@ -38,29 +37,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory, config: Config) -> list[Part
         manifest = json.loads(header.pop("__metadata__")["manifest"])
         parts.append((header, manifest, content[8 + size :]))
     return parts
-
-
-def change(value: Any, rng: random.Random) -> Any:
-    """JSON with something else somewhere: a value, an entry more or less, many entries."""
-    if isinstance(value, dict) and value and rng.random() < 0.95:
-        name, changed = rng.choice(sorted(value)), dict(value)
-        if rng.random() < 0.9:
-            changed[name] = change(value[name], rng)
-        else:
-            del changed[name]
-        if rng.random() < 0.1:
-            changed[rng.choice((*TEXTS, name + "s"))] = value[name]
-        return changed
-    if isinstance(value, list) and value and rng.random() < 0.8:
-        k = rng.randrange(len(value))
-        kept = value[k + rng.randrange(2) :]
-        return [*value[:k], change(value[k], rng), *kept] * rng.choice(
-            (1, 1, 1, 2, 500 if len(value) < 500 else 1)
-        )
-    if isinstance(value, int | float) and abs(value) < 1e300 and rng.random() < 0.6:
-        return rng.choice((-value, value + 1, value * 1.001, value * 10, value / 10, bool(value)))
-    lists = ([], {}, [[]] * 1_000, [0] * 20_000, json.loads("[" * 400 + "]" * 400))
-    return rng.choice((*NUMBERS, *TEXTS, None, *lists))
 
 
 def pack(parts: Parts, rng: random.Random) -> bytes:

@@ -10,9 +10,9 @@ import signal
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from fixtures.hostile import change
 
 from mjx_balance.config import preset, read_run_config, to_dict
 from mjx_balance.errors import InputError
@@ -33,8 +33,6 @@ pytestmark = pytest.mark.slow
 
 TODAY = {"scene_hash": "abc", "engine": "mujoco", "versions": {"jax": "0.9"}}
 PATIENCE_S = 2  #: a sentence comes within a second; the machine may be busy
-NUMBERS = (0, -1, 2**31, 2**63, 10**400, 0.5, -0.0, 1e308, float("nan"), float("inf"), True)
-TEXTS = ("", "x" * 100_000, "\x1b[2J", "\ud800", "\u202e", "../../outside", "a\0b", "__class__")
 
 
 @pytest.fixture(scope="module")
@@ -84,32 +82,12 @@ def entries(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if not path.is_symlink())
 
 
-def change_value(value: Any, rng: random.Random) -> Any:
-    """JSON with another value, one more or one less, somewhere."""
-    if isinstance(value, dict) and value and rng.random() < 0.9:
-        name = rng.choice(sorted(value))
-        changed = dict(value)
-        if rng.random() < 0.7:
-            changed[name] = change_value(value[name], rng)
-        else:
-            del changed[name]
-        if rng.random() < 0.2:
-            changed[rng.choice(TEXTS)] = value[name]
-        return changed
-    if isinstance(value, list) and value and rng.random() < 0.7:
-        k = rng.randrange(len(value))
-        return [*value[:k], change_value(value[k], rng), *value[k + 1 :]] * rng.choice((1, 1, 50))
-    return rng.choice(
-        (*NUMBERS, *TEXTS, None, [], {}, [[]] * 1_000, json.loads("[" * 400 + "]" * 400))
-    )
-
-
 def change_json(folder: Path, rng: random.Random) -> None:
     files = (path for path in entries(folder) if path.is_file())
     file = rng.choice([path for path in files if path.suffix in (".json", ".jsonl")])
     lines = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]
     k = rng.randrange(len(lines))
-    lines[k] = json.dumps(change_value(json.loads(lines[k]), rng))
+    lines[k] = json.dumps(change(json.loads(lines[k]), rng))
     file.write_text("\n".join(lines))
 
 

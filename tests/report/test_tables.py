@@ -72,7 +72,7 @@ def test_sweep_table() -> None:
 def test_the_summary_names_every_file_of_the_run() -> None:
     out = io.StringIO()
     run = Path("runs/a[b]")
-    tables.print_summary(Console(width=80, file=out), run, {"corner": CORNER}, 61.6)
+    tables.print_summary(Console(width=80, file=out), run, {"corner": CORNER}, 61.6, "go2")
     text = out.getvalue()
     for name in ("policy.safetensors", "evaluation.json", "figures/", "metrics.jsonl"):
         assert f"runs/a[b]/{name}" in text
