@@ -51,36 +51,35 @@ XLA_DAMAGED = "Error reading persistent compilation cache entry for '"
 LogFn: TypeAlias = Callable[[str], None]  #: takes one line for the user
 
 
-def cache_dir(name: str = "") -> Path:
-    """Where programs are kept: in $MJX_BALANCE_CACHE, or the user's cache folder.
-
-    Args:
-      name: of a folder in it, which is created. Others cannot write to it: whoever plants a program
-        there runs code here.
+def cache_dir() -> Path:
+    """Where programs are kept: $MJX_BALANCE_CACHE, or a folder in the user's cache folder.
 
     Raises:
-      OSError: if there is no such folder, or what is in it may be another user's.
+      OSError: if the user has neither.
     """
     if own := os.environ.get("MJX_BALANCE_CACHE"):
-        folder = Path(own) / name
-    elif caches := os.environ.get("XDG_CACHE_HOME"):
-        folder = Path(caches) / "mjx_balance" / name
-    else:
-        try:
-            folder = Path.home() / ".cache" / "mjx_balance" / name
-        except RuntimeError as error:
-            reason = "there is none; set MJX_BALANCE_CACHE"
-            raise OSError(errno.EACCES, reason, "the user's home") from error
-    if name:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if hasattr(os, "geteuid"):
-            _check_ours(folder)
-    return folder
+        return Path(own)
+    if caches := os.environ.get("XDG_CACHE_HOME"):
+        return Path(caches) / "mjx_balance"
+    try:
+        return Path.home() / ".cache" / "mjx_balance"
+    except RuntimeError as error:
+        reason = "there is none; set MJX_BALANCE_CACHE"
+        raise OSError(errno.EACCES, reason, "the user's home") from error
 
 
-def _check_ours(folder: Path) -> None:
-    """Makes a folder private; raises `OSError` if others may have written to it until now."""
+def private_folder(name: str) -> Path:
+    """A folder of the cache that no other user can write: whoever plants a program runs code here.
+
+    Raises:
+      OSError: if it cannot be created, or what is in it may be another user's.
+    """
+    folder = cache_dir() / name
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not hasattr(os, "geteuid"):
+        return folder
     mode = folder.stat().st_mode
+    is_shared = mode & 0o077
     for path in (folder, *folder.iterdir()):
         try:
             status = path.stat() if path == folder else path.lstat()
@@ -88,16 +87,18 @@ def _check_ours(folder: Path) -> None:
             continue
         if status.st_uid != os.geteuid():
             raise OSError(errno.EACCES, "it is another user's", str(path))
-        if mode & 0o077 and status.st_mode & 0o022 and not path.is_symlink():
+        if is_shared and status.st_mode & 0o022 and not path.is_symlink():
             raise OSError(errno.EACCES, "other users may write to it; delete it", str(path))
-    if mode & 0o077:
+    if is_shared:
         folder.chmod(0o700)
+    return folder
 
 
 def enable_compilation_cache(log_fn: LogFn) -> None:
     """Turns XLA's persistent cache on for every program; call before compiling."""
     try:
-        _, folder = cache_dir(TRACED), cache_dir(COMPILED)
+        private_folder(TRACED)
+        folder = private_folder(COMPILED)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
@@ -120,9 +121,10 @@ def mending_xla_cache(log_fn: LogFn) -> Iterator[None]:
             warnings.warn_explicit(warning.message, *origin)
             continue
         module = rest.partition("'")[0]
-        for entry in (cache_dir() / COMPILED).glob(f"{module}-*-cache"):
+        folder = cache_dir() / COMPILED
+        for entry in folder.glob(f"{module}-*-cache"):
             entry.unlink(missing_ok=True)
-        log_fn(f"compiled anew: what {cache_dir() / COMPILED} had of {module} was damaged")
+        log_fn(f"compiled anew: what {folder} had of {module} was damaged")
 
 
 def versions() -> dict[str, str | None]:
@@ -192,7 +194,10 @@ def compile_program(
         return jax.tree.leaves(state), output
 
     traced = jax.jit(flat, donate_argnums=0)
-    path = None if key is None else _file(key)
+    path = None
+    if key is not None:
+        with contextlib.suppress(OSError):  # no cache, as `enable_compilation_cache` has said
+            path = private_folder(TRACED) / f"{key}.stablehlo"
     if path is not None:
         exported = _load(path, log_fn)
         if exported is None:
@@ -201,13 +206,6 @@ def compile_program(
             _store(path, exported, log_fn)
         traced = jax.jit(exported.call, donate_argnums=0)
     return CompiledProgram(traced.lower(leaves).compile(compiler_options()), structure)
-
-
-def _file(key: str) -> Path | None:
-    """Of a program; None without a cache, as `enable_compilation_cache` has said."""
-    with contextlib.suppress(OSError):
-        return cache_dir(TRACED) / f"{key}.stablehlo"
-    return None
 
 
 def _load(path: Path, log_fn: LogFn) -> export.Exported | None:

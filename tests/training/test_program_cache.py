@@ -113,45 +113,31 @@ def test_a_run_works_without_a_cache_that_it_cannot_write(cache: Path) -> None:
     assert cache.read_text() == "no folder"
 
 
-def plant(cache: Path, planter: str) -> Path:
-    """A program that is not ours to run, in a cache as another user could have made it."""
-    folder = cache / "traced"
-    folder.mkdir(parents=True, mode=0o755)
-    doubled = jax.jit(lambda leaves: ([leaves[0] + 100, *leaves[1:]], {"sum": leaves[0]}))
-    program = bytes(jax.export.export(doubled)(jax.tree.leaves(start())).serialize())
-    file = folder / "key.stablehlo"
-    file.write_bytes(hashlib.sha256(program).digest() + program)
-    if planter == "in a folder of another":
-        os.chown(folder, 12_345, -1)
-    if planter == "of another":
-        os.chown(file, 12_345, -1)
-    if planter == "in a folder for all":
-        folder.chmod(0o777)
-        return folder
-    if planter == "for all":
-        file.chmod(0o666)
-    return file if "folder" not in planter else folder
-
-
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root gives away")
+@pytest.mark.parametrize("planted", ["traced", "traced/key.stablehlo"])
 @pytest.mark.parametrize(
-    ("planter", "reason"),
+    ("give", "reason"),
     [
-        ("in a folder of another", "it is another user's"),
-        ("of another", "it is another user's"),
-        ("in a folder for all", "other users may write to it; delete it"),
-        ("for all", "other users may write to it; delete it"),
+        (lambda path: os.chown(path, 12_345, -1), "it is another user's"),
+        (lambda path: path.chmod(0o777), "other users may write to it; delete it"),
     ],
+    ids=["another's", "all's"],
 )
 def test_a_program_that_another_user_may_have_planted_never_runs(
-    cache: Path, planter: str, reason: str
+    cache: Path, planted: str, give: Callable[[Path], None], reason: str
 ) -> None:
-    where, lines, counter = plant(cache, planter), [], Counter()
+    folder = cache / "traced"
+    folder.mkdir(parents=True, mode=0o755)
+    evil = jax.jit(lambda leaves: ([leaves[0] + 100, *leaves[1:]], {"sum": leaves[0]}))
+    program = bytes(jax.export.export(evil)(jax.tree.leaves(start())).serialize())
+    (folder / "key.stablehlo").write_bytes(hashlib.sha256(program).digest() + program)
+    give(cache / planted)
+    lines, counter = [], Counter()
     check_run(compile_program(counter.program, start(), "key", lines.append))
     assert counter.traced == 1
     before = jax.config.jax_compilation_cache_dir
     program_cache.enable_compilation_cache(lines.append)
-    assert lines == [f"nothing is cached, {where} cannot be used: {reason}"]
+    assert lines == [f"nothing is cached, {cache / planted} cannot be used: {reason}"]
     assert jax.config.jax_compilation_cache_dir == before
 
 
@@ -189,15 +175,15 @@ def test_a_cache_of_version_0_3_is_in_nobodys_way(cache: Path, xla_settings: Non
 def test_a_file_that_another_run_renames_now_is_no_error(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = program_cache.cache_dir("traced")
+    folder = program_cache.private_folder("traced")
     monkeypatch.setattr(Path, "iterdir", lambda folder: iter([folder / ".mjx_balance-1.part"]))
-    assert program_cache.cache_dir("traced") == folder
+    assert program_cache.private_folder("traced") == folder
 
 
 @pytest.mark.parametrize("content", [b"", b"no flatbuffer", bytes(1000), b"\xff" * 1000])
 def test_what_is_no_program_is_a_miss(cache: Path, content: bytes) -> None:
     """Though its digest is right."""
-    folder, lines, counter = program_cache.cache_dir("traced"), [], Counter()
+    folder, lines, counter = program_cache.private_folder("traced"), [], Counter()
     (folder / "key.stablehlo").write_bytes(hashlib.sha256(content).digest() + content)
     check_run(compile_program(counter.program, start(), "key", lines.append))
     assert counter.traced == 1
