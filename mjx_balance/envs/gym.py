@@ -311,16 +311,16 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):  #
           ValueError: for other options, or not as many seeds as envs.
           ResetNeeded: for a mask before the first reset.
         """
-        ids = np.flatnonzero(self._reset_mask(options))
-        if len(ids) < self.num_envs and self.batch is None:
+        mask = self._reset_mask(options)
+        if self.batch is None and not mask.all():
             raise ResetNeeded("reset_mask is given before the first reset of all envs")
         seeds = _seeds(seed, self.num_envs)
         old = self._rngs or [None] * self.num_envs
         self._rngs = [
-            np_random(number)[0] if rng is None or (number is not None and k in ids) else rng
-            for k, (number, rng) in enumerate(zip(seeds, old, strict=True))
+            np_random(number)[0] if rng is None or (number is not None and starts) else rng
+            for number, rng, starts in zip(seeds, old, mask, strict=True)
         ]
-        self._restart(ids)
+        self._restart(mask)
         return self._obs.copy(), {}
 
     def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray:
@@ -336,8 +336,9 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):  #
             )
         return mask
 
-    def _restart(self, ids: np.ndarray) -> None:
-        """Starts an episode in envs `ids`."""
+    def _restart(self, mask: np.ndarray) -> None:
+        """Starts an episode in the envs of a mask (n,), bool."""
+        ids = np.flatnonzero(mask)
         self._obs[ids] = self._start([self._rngs[k] for k in ids], ids)
         self._over[ids] = False
 
@@ -353,31 +354,29 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):  #
         change = self._height_changes(actions, self.action_space)
         if self.batch is None or (self._mode is AutoresetMode.DISABLED and self._over.any()):
             raise ResetNeeded(NO_EPISODE)
-        over, ids = np.flatnonzero(self._over), np.flatnonzero(~self._over)
-        whole = not len(over)
+        moves = ~self._over  # where not, an episode starts
+        ids = np.flatnonzero(moves)
         reward, tilt = np.zeros(self.num_envs), np.zeros(self.num_envs)
         terminated, truncated = np.zeros((2, self.num_envs), bool)
         if len(ids):
-            outcome = self.batch.step(change[ids], None if whole else ids)
+            outcome = self.batch.step(change[ids], None if moves.all() else ids)
             self._obs[ids], reward[ids] = outcome.obs, outcome.reward
             tilt[ids], terminated[ids] = outcome.tilt.mean(axis=-1), outcome.terminated
             late = self.batch.state.env_steps[ids] >= self.max_episode_steps
             truncated[ids] = ~outcome.terminated & late
-        if len(over):
-            self._restart(over)
-        self._over = done = terminated | truncated
-        moved = np.isin(np.arange(self.num_envs), ids)
-        if self._mode is not AutoresetMode.SAME_STEP:
-            return self._obs.copy(), reward, terminated, truncated, _info(tilt, terminated, moved)
-        info = _info(tilt, terminated, ~done)
-        if done.any():
-            ids = np.flatnonzero(done)
+        if not moves.all():
+            self._restart(~moves)
+        done = terminated | truncated
+        self._over = done.copy()
+        same_step = self._mode is AutoresetMode.SAME_STEP
+        info = _info(tilt, terminated, ~done if same_step else moves)
+        if same_step and done.any():
             final = np.full(self.num_envs, None, object)
-            for k in ids:
+            for k in np.flatnonzero(done):
                 final[k] = self._obs[k].copy()
-            info |= {"final_obs": final, "_final_obs": done.copy()}
+            info |= {"final_obs": final, "_final_obs": done}
             info |= {"final_info": _info(tilt, terminated, done), "_final_info": done.copy()}
-            self._restart(ids)
+            self._restart(done)
         return self._obs.copy(), reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:

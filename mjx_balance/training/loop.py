@@ -79,9 +79,10 @@ class Run:
 
 
 class Interrupts:
-    """Reasons to stop: an interrupt of the user, of whom a second one raises at once, or a failure.
+    """Reasons to stop: an interrupt of the user, or a write that failed.
 
-    A terminal that closes interrupts too (SIGHUP), unless the user has said `nohup`.
+    A second interrupt raises at once. A terminal that closes interrupts too (SIGHUP), unless the
+    user has said `nohup`.
     """
 
     failure: str | None = None  #: what could not be written
@@ -138,9 +139,8 @@ class Interrupts:
             except KeyboardInterrupt:
                 atexit.register(_leave, future)
                 raise
-            if (
-                self._first is not None and not self._answered
-            ):  # not in the handler, which may interrupt a print
+            # Not in the handler, which may interrupt a print.
+            if self._first is not None and not self._answered:
                 self._answered = True
                 self._log_fn(STOPPING)
 

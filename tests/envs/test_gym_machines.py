@@ -5,7 +5,6 @@ import dataclasses
 import pickle
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +16,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector
 
 from mjx_balance.config import Config, ConfigError, preset
-from mjx_balance.training.loop import Interrupts
 
 ENV = "mjx_balance/Balance-v0"
 COPIES: list[Callable[[Any], Any]] = [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]
@@ -62,13 +60,12 @@ def test_a_copy_goes_on_as_the_original(make_copy: Any, count: int, config: Conf
     for move in moves[:4]:
         env.step(move)
     twin = make_copy(env)
-    seen: dict[int, list[Any]] = {}
+    seen = []
     for own in (env, twin):
-        seen[id(own)] = [own.step(move) for move in moves[4:7]]
-        if not count:
-            seen[id(own)].append(own.reset())
-        seen[id(own)] += [own.step(move) for move in moves[7:]]
-    assert_same(seen[id(env)], seen[id(twin)])
+        steps = [own.step(move) for move in moves[4:7]]
+        begin = [] if count else [own.reset()]
+        seen.append([*steps, *begin, *(own.step(move) for move in moves[7:])])
+    assert_same(*seen)
 
 
 @pytest.mark.parametrize("make_copy", COPIES, ids=["deepcopy", "pickle"])
@@ -198,22 +195,3 @@ def test_a_spawned_process_makes_and_receives_envs(tmp_path: Any) -> None:
         [sys.executable, str(script), f"mjx_balance:{ENV}"], capture_output=True, text=True
     )
     assert (done.stdout, done.returncode) == ("True True\n", 0), done.stderr
-
-
-def test_a_thread_of_an_app_can_train() -> None:
-    """Signals are the main thread's; work goes on, and errors come through."""
-    outcomes: list[Any] = []
-
-    def work() -> None:
-        try:
-            with Interrupts(pytest.fail) as stop:
-                outcomes.append(stop.run(lambda: 7))
-                outcomes.append(bool(stop))
-                stop.run(lambda: 1 / 0)
-        except Exception as error:
-            outcomes.append(type(error))
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert outcomes == [7, False, ZeroDivisionError]

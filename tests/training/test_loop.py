@@ -317,6 +317,25 @@ def test_a_hangup_that_the_user_ignores_stays_ignored(display: Any) -> None:
         signal.signal(signal.SIGHUP, before)
 
 
+def test_a_thread_of_an_app_can_train() -> None:
+    """Signals are the main thread's; work goes on, and errors come through."""
+    outcomes: list[Any] = []
+
+    def work() -> None:
+        try:
+            with Interrupts(pytest.fail) as stop:
+                outcomes.append(stop.run(lambda: 7))
+                outcomes.append(bool(stop))
+                stop.run(lambda: 1 / 0)
+        except Exception as error:
+            outcomes.append(type(error))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert outcomes == [7, False, ZeroDivisionError]
+
+
 def wait_for_answer(display: Any) -> None:
     until = time.monotonic() + 10
     while STOPPING not in display.lines:
