@@ -16,18 +16,19 @@ from pathlib import Path
 
 import common
 import numpy as np
+import psutil
 
 FAULT_EVERY = 10_000
+"""Samples from one impossible reading to the next."""
 REST = (0, 0, 0, 0, 0, 9.81)
 """Gyro, rad/s, and accelerometer, m/s^2, of a standing robot."""
 READINGS = 1_000
 """How often memory is read in all."""
 
 
-def resident(process: int | str = "self") -> float:
-    """Memory of a process, MiB."""
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * 4096 / 2**20
+def resident(process: int | None = None) -> float:
+    """Memory of a process, or of this one, MiB."""
+    return psutil.Process(process).memory_info().rss / 2**20
 
 
 def train(engine: str, minutes: float) -> list[float]:

@@ -5,8 +5,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
-
 CONTROL_GROUPS = Path("/sys/fs/cgroup")  #: by which Linux limits containers, version 1 or 2
 MEMBERSHIP = Path("/proc/self/cgroup")  #: lines NUMBER:CONTROLLERS:PATH; version 2 names none
 
@@ -31,6 +29,8 @@ def cores() -> int:
 
 def available_memory() -> int:
     """Memory that this process may still take, bytes."""
+    import psutil  # not where only cores are asked for
+
     available = psutil.virtual_memory().available
     for group in _control_groups("memory"):
         limit = _words(group / "memory.max") or _words(group / "memory.limit_in_bytes")
