@@ -2,9 +2,10 @@
 
 import os
 import re
+import socket
 import subprocess
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,22 @@ def robot() -> Robot:
 def xp(request: pytest.FixtureRequest) -> types.ModuleType:
     """Both array libraries that the task's functions run on."""
     return request.param
+
+
+@pytest.fixture
+def address() -> tuple[str, int]:
+    """An IP and a port at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()
+
+
+@pytest.fixture
+def opened() -> Iterator[list[socket.socket]]:
+    """Connections to close at the end."""
+    connections: list[socket.socket] = []
+    yield connections
+    for connection in connections:
+        connection.close()
 
 
 @pytest.fixture

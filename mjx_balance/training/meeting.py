@@ -129,15 +129,13 @@ def _ask(caller: socket.socket, hellos: "queue.SimpleQueue[tuple[socket.socket, 
     """Asks who has connected: a process of ours goes into `hellos`, a stranger is dropped."""
     nonce = secrets.token_hex()  # so that a hello that somebody has recorded is none
     _send([caller], {"mjx_balance": nonce})
-    try:
+    with contextlib.suppress(InputError):
         hello = parse(Hello, _receive(caller, time.monotonic() + HELLO_S))
-    except InputError:
-        hello = None
-    if hello is not None and hello.mjx_balance == nonce:
-        caller.settimeout(HELLO_S)
-        hellos.put((caller, hello))
-    else:
-        caller.close()
+        if hello.mjx_balance == nonce:
+            caller.settimeout(HELLO_S)
+            hellos.put((caller, hello))
+            return
+    caller.close()
 
 
 def _shut_down(caller: socket.socket) -> None:

@@ -270,5 +270,4 @@ def share_machine(everyone: Sequence[Member], index: int) -> int:
     if hasattr(os, "SCHED_BATCH"):
         with contextlib.suppress(OSError):  # not everybody may
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    most = (min(len(share), own.num_cores) for share, own in zip(shares, everyone, strict=True))
-    return min(most)
+    return min(min(len(share), own.num_cores) for share, own in zip(shares, everyone, strict=True))

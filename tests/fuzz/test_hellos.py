@@ -82,20 +82,6 @@ def send(connection: socket.socket, data: bytes, rng: random.Random) -> None:
             connection.close()
 
 
-@pytest.fixture
-def address() -> Address:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()
-
-
-@pytest.fixture
-def opened() -> Iterator[list[socket.socket]]:
-    connections: list[socket.socket] = []
-    yield connections
-    for connection in connections:
-        connection.close()
-
-
 def start(call: Callable[[], Any], outcomes: dict[str, Any], name: str) -> threading.Thread:
     """Runs a call in a thread; its outcome is what it returns or raises."""
 
@@ -122,17 +108,15 @@ def stranger(address: Address, rng: random.Random, opened: list[socket.socket]) 
         connection = socket.create_connection(address, timeout=5)
         opened.append(connection)
         nonce = json.loads(connection.makefile("rb").readline())["mjx_balance"]
-        if rng.random() < 0.3:
+        is_known = rng.random() < 0.7
+        if not is_known:
             nonce = rng.choice(("", nonce[:-1], nonce.upper() + " ", "0" * 64))
-            wrong = True
-        else:
-            wrong = False
         hello = Hello(nonce, 1, rng.choice((2, 3)), OWN)
         message = dataclasses.asdict(hello)
-        if not wrong or rng.random() < 0.5:
+        if is_known or rng.random() < 0.5:
             message = mutate(message, rng)
         send(connection, to_bytes(message, rng), rng)
-        return not wrong
+        return is_known
     return False
 
 
@@ -154,7 +138,9 @@ def test_strangers_never_harm_a_meeting(
         count += 1
         for outcome in outcomes.values():
             if isinstance(outcome, tuple):
-                assert outcome[1] == (OWN, OWN)
+                process_0, other = outcome[1]
+                assert process_0 == OWN
+                assert other == OWN or any(known)
                 opened += outcome[0].values()
             else:
                 assert any(known)

@@ -4,6 +4,7 @@ import dataclasses
 import types
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -328,15 +329,10 @@ def test_a_resumed_run_has_its_devices_where_there_are_fewer_cores(
     [(AssertionError(), ""), (RuntimeError("no\x1b[2J\n" + 500 * "x"), " (no?[2J xxx")],
 )
 def test_a_platform_that_is_not_there_is_named(
-    error: Exception, reason: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    error: Exception, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """JAX raises either, depending on the name."""
-
-    def fail() -> None:
-        raise error
-
-    monkeypatch.setenv("MJX_BALANCE_CACHE", str(tmp_path))
-    monkeypatch.setattr(jax, "process_count", fail)
+    monkeypatch.setattr(jax, "process_count", mock.Mock(side_effect=error))
     monkeypatch.setattr(sizing, "enable_compilation_cache", lambda log_fn: None)
     with pytest.raises(ConfigError) as refused:
         sizing.configure_jax(lambda line: None)

@@ -17,13 +17,6 @@ from mjx_balance.training.meeting import Member, ProcessError, Watch, host, visi
 Address = tuple[str, int]
 
 
-@pytest.fixture
-def address() -> Address:
-    """An address at which nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()
-
-
 def at_once(*calls: Callable[[], Any]) -> list[Any]:
     """What each of the calls, in a thread of its own, returns or raises within 40 s."""
     outcomes: list[Any] = [TimeoutError("it hangs")] * len(calls)
@@ -41,16 +34,6 @@ def at_once(*calls: Callable[[], Any]) -> list[Any]:
     for thread in threads:
         thread.join(max(0.0, until - time.monotonic()))
     return outcomes
-
-
-@pytest.fixture
-def opened() -> Iterator[list[socket.socket]]:
-    """Connections to close at the end."""
-    with contextlib.ExitStack() as stack:
-        connections: list[socket.socket] = []
-        yield connections
-        for connection in connections:
-            stack.enter_context(connection)
 
 
 @pytest.fixture
@@ -174,28 +157,36 @@ def test_strangers_neither_end_nor_block_the_meeting(
     assert time.monotonic() - began < 15
 
 
-@pytest.mark.parametrize("say", [b"", b"[", None], ids=["idle", "slow", "reset"])
+def say_little(callers: list[socket.socket]) -> None:
+    for caller in callers[-10:]:
+        with contextlib.suppress(OSError):  # it has been dropped
+            caller.sendall(b"[")
+
+
+def scan(callers: list[socket.socket]) -> None:
+    """As a port scanner does: away at once, without a goodbye."""
+    callers[-1].setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    callers.pop().close()
+
+
+@pytest.mark.parametrize("behave", [len, say_little, scan], ids=["idle", "slow", "reset"])
 def test_no_number_of_strangers_keeps_a_process_out(
-    say: bytes | None, address: Address, opened: Any, come: Any
+    behave: Callable[[list[socket.socket]], Any], address: Address, come: Any
 ) -> None:
-    """Three times as many as may wait, and more of them until the end; some say a byte a second."""
+    """Three times as many as may wait, and more of them until the end."""
     over = threading.Event()
 
     def flood() -> None:
-        opened.append(knock(address))
+        callers = [knock(address)]
         with contextlib.suppress(OSError):  # the meeting is over
             while not over.is_set():
-                opened.append(knock(address, 0.1))
-                if say is None:  # what a port scanner does: away at once, without a goodbye
-                    linger = struct.pack("ii", 1, 0)
-                    opened[-1].setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
-                    opened.pop().close()
-                if len(opened) > 3 * meeting.CALLERS:
-                    opened.pop(0).close()
+                callers.append(knock(address, 0.1))
+                behave(callers)
+                if len(callers) > 3 * meeting.CALLERS:
+                    callers.pop(0).close()
                     time.sleep(0.01)
-                for one in opened[-10:] if say else []:
-                    with contextlib.suppress(OSError):
-                        one.sendall(say or b"")
+        for caller in callers:
+            caller.close()
 
     def second() -> Any:
         time.sleep(1.5)
@@ -246,17 +237,19 @@ def test_a_process_that_was_killed_may_come_again(address: Address, come: Any) -
     assert others == [first, first]
 
 
+def play_first(address: Address, answer: bytes = b"") -> None:
+    """A process 0 that greets one process, answers its hello, and goes."""
+    with socket.create_server(address) as server:
+        connection, _ = server.accept()
+    with connection:
+        connection.sendall(b'{"mjx_balance": "1"}\n')
+        connection.recv(10_000)
+        connection.sendall(answer)
+
+
 def test_whoever_comes_after_the_meeting_is_told(address: Address, come: Any) -> None:
     """Process 0 has gone while process 1 waits for process 2."""
-
-    def first() -> None:
-        with socket.create_server(address) as server:
-            connection, _ = server.accept()
-            connection.sendall(b'{"mjx_balance": "1"}\n')
-            connection.recv(1000)
-        connection.close()
-
-    _, outcome = at_once(first, lambda: come(1, 3))
+    _, outcome = at_once(lambda: play_first(address), lambda: come(1, 3))
     assert message(outcome) == f"process 0 has left the meeting at 127.0.0.1 port {address[1]}"
 
 
@@ -280,15 +273,8 @@ def test_another_service_at_the_address_is_not_joined(
     "everyone", [5, [], [{"machine": "m"}], [{"machine": 1, "cores": [], "num_cores": 1}] * 2]
 )
 def test_what_process_0_says_is_checked(everyone: Any, address: Address, come: Any) -> None:
-    def first() -> None:
-        with socket.create_server(address) as server:
-            connection, _ = server.accept()
-            connection.sendall(b'{"mjx_balance": "1"}\n')
-            connection.recv(10_000)
-            connection.sendall(json.dumps({"everyone": everyone}).encode() + b"\n")
-            connection.close()
-
-    _, outcome = at_once(first, lambda: come(1, 2))
+    answer = json.dumps({"everyone": everyone}).encode() + b"\n"
+    _, outcome = at_once(lambda: play_first(address, answer), lambda: come(1, 2))
     assert len(message(outcome)) < 300
 
 

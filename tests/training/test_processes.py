@@ -3,10 +3,10 @@
 import os
 import socket
 import threading
-import types
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -113,25 +113,26 @@ def test_what_differs_is_named_by_all(together: Together) -> None:
     }
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux binds processes to cores")
 @pytest.mark.parametrize("error", [ProcessError("x"), ConfigError("x"), EvaluationError("x")])
 def test_only_what_all_raise_lets_all_leave(
     error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What one process alone raises ends it: the others wait for it, and see it gone."""
-    steps: list[Any] = []
-    stub = types.SimpleNamespace(leave=lambda: steps.append("leave"))
-    monkeypatch.setattr(processes, "_connect", lambda cluster: stub)
-    monkeypatch.setattr(processes, "time", types.SimpleNamespace(sleep=lambda seconds: None))
-    register = types.SimpleNamespace(register=lambda function, code: steps.append(function))
-    monkeypatch.setattr(processes, "atexit", register)
+    joined, at_exit = mock.Mock(), mock.Mock()
+    monkeypatch.setattr(processes, "_connect", lambda cluster: joined)
+    monkeypatch.setattr(processes, "time", mock.Mock())
+    monkeypatch.setattr(processes, "atexit", at_exit)
     cluster = processes.Cluster("localhost:1", 2, 0)
     with pytest.raises(type(error)), processes.joined(cluster, (ConfigError,)):
         raise error
     alone = isinstance(error, EvaluationError)
-    assert steps == ([processes.exit_at_once] if alone else ["leave"])
+    assert joined.leave.call_count == (not alone)
+    assert [call.args[0] for call in at_exit.register.mock_calls] == (
+        [processes.exit_at_once] if alone else []
+    )
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux binds processes to cores")
 def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that may use the same ones; whoever was bound already stays where it is."""
     bound: list[Sequence[int]] = []
@@ -226,11 +227,8 @@ def test_jax_finds_slurm_and_open_mpi(
 def test_a_machine_whose_own_name_is_unknown_is_told(
     error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: Any) -> None:
-        raise error
-
     monkeypatch.setattr(socket, "gethostname", lambda: "node-7\x1b")
-    monkeypatch.setattr(socket, "getaddrinfo", fail)
+    monkeypatch.setattr(socket, "getaddrinfo", mock.Mock(side_effect=error))
     with pytest.raises(ProcessError) as refused:
         processes._check_own_name()
     assert str(refused.value) == (
