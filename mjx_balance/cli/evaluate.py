@@ -22,8 +22,8 @@ class EvaluateArgs(ControllerArgs):
     """Evaluate a policy in plain MuJoCo on all cores. Needs no JAX."""
 
     suite: str = "paper"
-    """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast or
-    steep."""
+    """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast,
+    steep, steps or sea."""
     scenarios: int = 256
     """Number of scenarios."""
     duration: float = 60.0

@@ -58,6 +58,19 @@ class TaskConfig:
     others come from the paper's disc (paper: 0)."""
     target_period: Positive = 10.0
     """Time between board targets, s (paper 3.1)."""
+    board_motions: Annotated[tuple[Literal["ramps", "steps", "sea"], ...], Len(1, 3)] = ("ramps",)
+    """Kinds of board motion in training, drawn equally often: ramps to targets (paper 3.1), jumps,
+    or waves of the sea (task/tilt.py)."""
+    step_rate: Positive = 20.0
+    """Speed of a jump on each axis, deg/s (chosen: the board's servo reaches it within 13 ms, so
+    that the board falls away from under the feet with less than 1 g)."""
+    sea_angle: NonNegative | None = None
+    """Significant height of the board's angle at sea, crest to trough, deg; none: the greatest that
+    max_incline and board_rate allow."""
+    sea_period: Positive = 10.0
+    """Peak period of the sea, s (chosen: a moderate sea)."""
+    sea_heading: Annotated[float, Ge(-360), Le(360)] | None = None
+    """Mean direction in which the waves run, deg from straight ahead to the left; none: any."""
     fail_tilt: Annotated[float, Gt(0), Lt(90)] = 6.0
     """Body tilt that counts as a fall, deg (paper 3.1)."""
     action_max: Positive = 0.003
@@ -107,6 +120,14 @@ class TaskConfig:
     def ramp_steps(self) -> int:
         """Physics steps in which the legs reach their new heights, at least one."""
         return max(1, round(self.action_ramp * self.sim_steps))
+
+    @property
+    def jump_incline(self) -> float:
+        """Greatest tilt between jumps, deg.
+
+        The body tilts with a jump before the legs can move: two thirds of fail_tilt at most.
+        """
+        return min(self.max_incline, self.fail_tilt / 3)
 
     @property
     def num_actions(self) -> int:

@@ -2,6 +2,7 @@
 
 from mjx_balance.config.presets import preset
 from mjx_balance.config.schema import Config, ConfigError, RandomizationConfig, TaskConfig
+from mjx_balance.config.sea import significant_angle
 from mjx_balance.config.sweep import sweep_grid, with_values
 from mjx_balance.files.validation import check_types
 from mjx_balance.text import quote
@@ -24,6 +25,7 @@ def check(config: Config) -> Config:
     preset(config.preset)
     _check_runs(config)
     _check_timing(config.task)
+    _check_motions(config.task)
     _check_inputs(config.task)
     _check_learning(config)
     _check_randomization(config.randomization, config.task)
@@ -67,6 +69,20 @@ def _check_timing(task: TaskConfig) -> None:
             f"target_period is {task.target_period} s, but a board ramp may last twice the "
             f"greatest incline over board_rate, {ramp:g} s; the period must not be shorter"
         )
+
+
+def _check_motions(task: TaskConfig) -> None:
+    if len(set(task.board_motions)) < len(task.board_motions):
+        raise ConfigError(
+            f"board_motions is {task.board_motions}; it must name each kind at most once"
+        )
+    slowest = 2 * task.jump_incline / task.target_period
+    if task.step_rate < slowest:
+        raise ConfigError(
+            f"step_rate is {task.step_rate} deg/s; for a jump to end within target_period, "
+            f"{task.target_period} s, it must be at least {slowest:.3g}"
+        )
+    significant_angle(task)
 
 
 def _check_inputs(task: TaskConfig) -> None:

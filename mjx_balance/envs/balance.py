@@ -17,7 +17,7 @@ from mjx_balance.task.randomization import DRAWS, draw_params
 from mjx_balance.task.reward import reward_rows
 from mjx_balance.task.step import EnvState, initial_memory, observation, step
 from mjx_balance.task.symmetry import Symmetries, symmetries
-from mjx_balance.task.tilt import draw_scenario
+from mjx_balance.task.tilt import MOST_CALLS, draw_scenario
 
 
 class Metric(NamedTuple):
@@ -108,7 +108,7 @@ class BalanceEnv(Env):
         if len(due):
             draws = jax.random.uniform(key_pushes, (len(due), 2), jnp.float32)
             pushes = Pushes(draw_velocity(ranges, draws), jnp.asarray(due, jnp.int32))
-        keys = iter(jax.random.split(rng, 4))
+        keys = iter(jax.random.split(rng, MOST_CALLS))
 
         def uniform(shape: tuple[int, ...], low: float, high: float) -> jax.Array:
             return jax.random.uniform(next(keys), shape, jnp.float32, low, high)

@@ -1,7 +1,7 @@
 """`BatchEnv`: many envs in plain MuJoCo, in NumPy, as `BalanceEnv` is one in JAX. No JAX."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,7 +13,9 @@ from mjx_balance.sim.scene import Scene
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
 from mjx_balance.task.step import EnvState, Outcome, initial_memory, observation, step
-from mjx_balance.task.tilt import Scenario, draw_scenario
+from mjx_balance.task.tilt import Scenario, draw_scenario, numpy_uniform
+
+T = TypeVar("T")
 
 
 class Episodes(NamedTuple):
@@ -41,16 +43,13 @@ def draw_episodes(
     """
     due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
     params, pushes = None, None
-    scenarios = [
-        draw_scenario(task, lambda shape, low, high: np.asarray(rng.uniform(low, high, shape)))  # noqa: B023
-        for rng in rngs
-    ]
+    scenarios = [draw_scenario(task, numpy_uniform(rng)) for rng in rngs]
     if ranges.varies:
         params = draw_params(ranges, robot, np.stack([rng.uniform(size=DRAWS) for rng in rngs]))
     if len(due):
         uniform = np.stack([rng.uniform(size=(len(due), 2)) for rng in rngs])
         pushes = Pushes(draw_velocity(ranges, uniform), np.tile(due, (len(rngs), 1)))
-    return Episodes(Scenario(*map(np.stack, zip(*scenarios, strict=True))), params, pushes, rngs)
+    return Episodes(stacked(scenarios), params, pushes, rngs)
 
 
 class BatchEnv:
@@ -111,6 +110,11 @@ class BatchEnv:
     def qvel(self) -> Float[np.ndarray, "n nv"]:
         """Velocities now."""
         return self._engine.state()[1]
+
+
+def stacked(trees: Sequence[T]) -> T:
+    """One nested tuple of arrays from several alike, along a new first axis."""
+    return _tree_map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def rows(tree: Any, ids: np.ndarray) -> Any:

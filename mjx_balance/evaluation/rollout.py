@@ -16,7 +16,7 @@ from mjx_balance.config import TaskConfig
 from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.errors import InputError
 from mjx_balance.evaluation.controllers import Controller, View
-from mjx_balance.evaluation.suites import draw_suite
+from mjx_balance.evaluation.suites import SUITES, draw_suite
 from mjx_balance.machine import available_memory
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.robots.catalogue import RobotError, find_robot, shipped
@@ -160,7 +160,7 @@ def summarize(rollout: Rollout, suite: str, duration: float, seed: int) -> dict[
             "max": float(tilts.max()),
         },
         "action_mm_mean": float(np.nanmean(rollout.action_mm)),
-        "action_mm_settled": settled_action(rollout),
+        "action_mm_settled": None if SUITES[suite].motion == "sea" else settled_action(rollout),
         "physics_steps_per_second": float(rollout.fell_at.sum() / rollout.seconds),
     }
 

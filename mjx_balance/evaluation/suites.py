@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mjx_balance.config import RandomizationConfig, TaskConfig
-from mjx_balance.envs.batch import Episodes
+from mjx_balance.envs.batch import Episodes, stacked
 from mjx_balance.errors import InputError
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import authority, greatest_incline, scale_ranges
@@ -35,7 +35,8 @@ class Suite:
 
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
-    """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg."""
+    """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg, of ramps."""
+    motion: str | None = None  #: kind of board motion (`tilt.MOTIONS`) instead of ramps
     fast: bool = False  #: board speeds uniform from the config's to the authority limit
     steep: bool = False  #: inclines uniform from the config's to the reach of the legs
 
@@ -51,6 +52,8 @@ SUITES: dict[str, Suite] = {
     "push": Suite(RandomizationConfig(push_min=0.2, push_max=0.4)),  # any direction, every 5 s
     "fast": Suite(fast=True),
     "steep": Suite(steep=True),
+    "steps": Suite(motion="steps"),  # jumps of up to two thirds of the fall limit
+    "sea": Suite(motion="sea"),  # waves in all directions
 }
 """By the names of `mjx-balance evaluate --suite`."""
 HEADLINE = ("paper", "corner")  #: evaluated after training, in reports and tables
@@ -82,10 +85,11 @@ def draw_suite(
 ) -> Episodes:
     """Draws a suite's episodes, each of `duration` s.
 
-    Scenario k of a seed is the same however many are drawn. Scenario, sensor noise and pushes come
-    from generators of their own, told apart by their last number.
+    Scenario k of a seed is the same however many are drawn. Ramps, sensor noise, pushes and other
+    motions come from generators of their own, told apart by their last number.
 
     Raises:
+      ConfigError: if the sea of the config is out of bounds.
       SuiteError: for an unknown suite, a negative seed, or a board that does not arrive
         before its next target.
     """
@@ -110,8 +114,13 @@ def draw_suite(
             f"{longest:.1f} s to its target; the period must not be shorter"
         )
     ranges = scale_ranges(chosen.randomization, robot)
+    scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
+    if chosen.motion is not None:
+        draw = tilt.MOTIONS[chosen.motion].draw
+        own = [np.random.default_rng((seed, k, 3)) for k in range(scenarios)]
+        scenario = stacked([draw(task, count, tilt.numpy_uniform(rng)) for rng in own])
     return Episodes(
-        scenario=tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate),
+        scenario=scenario,
         params=draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None,
         pushes=_draw_pushes(task, ranges, scenarios, duration, seed),
         rngs=[np.random.default_rng((seed, k, 1)) for k in range(scenarios)],

@@ -1,13 +1,32 @@
-"""Board tilt: a scenario is a value, and the board's angle a closed form of it."""
+"""Board tilt: a scenario is a value, and the board's angle a closed form of it.
 
+The angle is the sum of a motion from target to target and of waves. `MOTIONS` is the table of the
+kinds of motion.
+"""
+
+import dataclasses
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from mjx_balance.config import TaskConfig
+from mjx_balance.config.sea import WAVES, fade, frequency, significant_angle
 from mjx_balance.task import Array
+
+Uniform: TypeAlias = Callable[[tuple[int, ...], float, float], Array]
+"""(shape, low, high) -> new random numbers in [low, high)."""
+MOST_CALLS = 16  #: greatest number of calls of `uniform` that a scenario takes
+
+
+class Waves(NamedTuple):
+    """Sines that are added to the board's angle, from the first peak period on in full."""
+
+    amplitude: Float[Array, "*batch waves 2"]  #: about X and Y, deg
+    omega: Float[Array, "*batch waves"]  #: frequency, rad/s
+    phase: Float[Array, "*batch waves 2"]  #: at time 0, rad
 
 
 class Scenario(NamedTuple):
@@ -20,6 +39,12 @@ class Scenario(NamedTuple):
     targets: Float[Array, "*batch targets 2"]  #: board angles about X and Y, deg
     phase: Float[Array, "*batch"]  #: time the first target is already old at time 0, s
     rate: Float[Array, "*batch"]  #: speed of the board on each axis, deg/s
+    waves: Waves | None = None  #: None: none
+
+
+def numpy_uniform(rng: np.random.Generator) -> Uniform:
+    """Draws from a generator."""
+    return lambda shape, low, high: np.asarray(rng.uniform(low, high, shape))
 
 
 def num_targets(task: TaskConfig, duration: float) -> int:
@@ -34,8 +59,28 @@ def board_angle(
 
     Each axis moves at `rate` from the last target to the next and then rests; it always arrives
     within the period (config and suites check that), so the angle is a closed form of the time.
+    Waves are added.
     """
-    targets, phase, rate = scenario
+    angle = _toward_targets(task, scenario, time)
+    return angle if scenario.waves is None else angle + _at_sea(task, scenario.waves, time)
+
+
+def _at_sea(
+    task: TaskConfig, waves: Waves, time: Float[Array, "*batch times"]
+) -> Float[Array, "*batch times 2"]:
+    """Sum of the waves, deg."""
+    xp = time.__array_namespace__()
+    turn = (time[..., None] * waves.omega[..., None, :])[..., None]
+    sines = xp.sin(turn + waves.phase[..., None, :, :])
+    total = (waves.amplitude[..., None, :, :] * sines).sum(axis=-2)
+    return fade(time, task.sea_period)[..., None] * total
+
+
+def _toward_targets(
+    task: TaskConfig, scenario: Scenario, time: Float[Array, "*batch times"]
+) -> Float[Array, "*batch times 2"]:
+    """Angle of a board without waves, deg."""
+    targets, phase, rate, _ = scenario
     xp = targets.__array_namespace__()
     clock = time + phase[..., None]
     last = targets.shape[-2] - 1
@@ -67,19 +112,35 @@ def disc_targets(
     return (incline * magnitude)[..., None] * unit
 
 
-def draw_scenario(
-    task: TaskConfig, uniform: Callable[[tuple[int, ...], float, float], Array]
-) -> Scenario:
+def draw_scenario(task: TaskConfig, uniform: Uniform) -> Scenario:
     """Draws one scenario of training, long enough for an episode.
 
-    The random phase keeps thousands of boards from turning at the same time.
+    With several kinds of motion each is drawn equally often. Ramps alone have no waves.
 
     Args:
-      task: inclines, the share of the square, the board's speed, the episode's length.
-      uniform: (shape, low, high) -> new random numbers in [low, high); the four calls always come
-        in the same order.
+      task: kinds of motion and their numbers, the episode's length.
+      uniform: (shape, low, high) -> new random numbers in [low, high), at most `MOST_CALLS` times;
+        the calls always come in the same order.
     """
     count = num_targets(task, task.episode_length * task.ctrl_dt)
+    drawn = [MOTIONS[name].draw(task, count, uniform) for name in task.board_motions]
+    if len(drawn) == 1:
+        return drawn[0]
+    number = uniform((), 0.0, float(len(drawn)))
+    xp = number.__array_namespace__()
+    calm = Waves(
+        *(xp.zeros(shape, dtype=number.dtype) for shape in ((WAVES, 2), WAVES, (WAVES, 2)))
+    )
+    kinds = [(*x[:3], *(calm if x.waves is None else x.waves)) for x in drawn]
+    chosen: list[Array] = list(kinds[0])
+    for k, kind in enumerate(kinds[1:], start=1):
+        chosen = [xp.where(number < k, *pair) for pair in zip(chosen, kind, strict=True)]
+    targets, phase, rate, *waves = chosen
+    return Scenario(targets, phase, rate, Waves(*waves))
+
+
+def _draw_ramps(task: TaskConfig, count: int, uniform: Uniform) -> Scenario:
+    """The random phase keeps thousands of boards from turning at the same time."""
     direction, magnitude = uniform((2, count), 0.0, 1.0)
     square = uniform((count, 2), -1.0, 1.0)
     in_square = uniform((count, 1), 0.0, 1.0) < task.square_share
@@ -92,3 +153,61 @@ def draw_scenario(
     targets = xp.where(first, xp.zeros_like(targets), targets)
     rate = xp.zeros_like(phase) + task.board_rate
     return Scenario(targets, phase * task.target_period, rate)
+
+
+def _draw_steps(task: TaskConfig, count: int, uniform: Uniform) -> Scenario:
+    """Jumps at `step_rate` between targets up to `jump_incline`."""
+    steps = dataclasses.replace(task, max_incline=task.jump_incline, square_share=0.0)
+    return _draw_ramps(dataclasses.replace(steps, board_rate=task.step_rate), count, uniform)
+
+
+def _draw_sea(task: TaskConfig, count: int, uniform: Uniform) -> Scenario:
+    """Waves of equal energy, each with a frequency from its share of the spectrum.
+
+    A frequency drawn anew in every scenario makes none repeat itself. Directions spread about the
+    heading with the square of the cosine (ITTC 7.5-02-07-01.1, section 3.2): the sine of the
+    angle is a coordinate of a point drawn uniformly from the unit disc.
+    """
+    share, phase, radius, turn = uniform((4, WAVES), 0.0, 1.0)
+    heading = uniform((), -np.pi, np.pi)
+    xp = share.__array_namespace__()
+    if task.sea_heading is not None:
+        heading = xp.zeros_like(heading) + math.radians(task.sea_heading)
+    spread = xp.arcsin(xp.sqrt(radius) * xp.cos(2 * np.pi * turn))
+    # From (k, k + 1]: the logarithm of 0 is none of a frequency's.
+    omega = (2 * np.pi / task.sea_period) * frequency((np.arange(1, WAVES + 1) - share) / WAVES)
+    unit = _wave_axes(heading + spread)
+    amplitude = significant_angle(task) / 4 * math.sqrt(2 / WAVES)
+    start = 2 * np.pi * phase[:, None]
+    waves = Waves(amplitude * unit, omega, start + xp.zeros_like(unit))
+    still = xp.zeros_like(heading)
+    return Scenario(xp.zeros((count, 2), dtype=share.dtype), still, still + task.board_rate, waves)
+
+
+def _wave_axes(heading: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
+    """Board angles about X and Y per unit of slope of waves that run in a direction, rad.
+
+    A board that rises to the left turns about +X, one that rises ahead about -Y.
+    """
+    xp = heading.__array_namespace__()
+    return xp.stack((xp.sin(heading), -xp.cos(heading)), axis=-1)
+
+
+class BoardMotion(NamedTuple):
+    """A kind of board motion."""
+
+    name: str  #: as in `TaskConfig.board_motions`
+    draw: Callable[[TaskConfig, int, Uniform], Scenario]
+    """(task, number of targets, uniform) -> one scenario; `uniform` as of `draw_scenario`."""
+
+
+MOTIONS = {
+    row.name: row
+    for row in (
+        BoardMotion("ramps", _draw_ramps),
+        BoardMotion("steps", _draw_steps),
+        BoardMotion("sea", _draw_sea),
+    )
+}
+"""The kinds by name. Each is a case of the one closed form of `board_angle`, so that envs of one
+batch may differ in kind. To add one: a row here, and its name in `TaskConfig.board_motions`."""

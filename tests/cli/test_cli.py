@@ -222,7 +222,7 @@ def test_what_cannot_be_resumed_is_refused(
         ("robot new scenes:quadruped.xml --out gone/rex.toml", "cannot write gone/rex.toml"),
         ("view", "name a policy file or --controller NAME"),
         ("view nobody", "no policy file at nobody; `mjx-balance train` writes one, and best"),
-        ("view best --suite sea", "unknown suite 'sea'"),
+        ("view best --suite moon", "unknown suite 'moon'"),
         ("view best --seed -1", "seed is -1; it must not be negative"),
         ("view best", "); `mjx-balance evaluate --video` needs no display"),
     ],

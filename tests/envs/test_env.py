@@ -158,7 +158,7 @@ def test_boards_go_where_their_scenario_says(
     for number in range(EPISODE + 1):
         expected = [
             walked(targets, phase, rate, 0.2 * number)
-            for targets, phase, rate in zip(*scenario, strict=True)
+            for targets, phase, rate in zip(*scenario[:3], strict=True)
         ]
         np.testing.assert_allclose(board[number], expected, atol=0.06)
     assert np.ptp(board[-1], axis=0).min() > 5
@@ -218,7 +218,8 @@ def uniform(values: np.ndarray, low: float, high: float) -> bool:
 
 def test_targets_fill_the_disc_as_the_paper_says(config: Config) -> None:
     """Any direction, total tilt uniform up to 7 deg; the board starts level, at any age."""
-    targets, phase, rate = scenarios(config, 30.0, 0.0)
+    targets, phase, rate, waves = scenarios(config, 30.0, 0.0)
+    assert waves is None
     assert targets.shape == (RESETS, 4, 2)
     assert not targets[:, 0].any()
     assert uniform(phase, 0, 10)
@@ -232,9 +233,30 @@ def test_targets_fill_the_disc_as_the_paper_says(config: Config) -> None:
     assert np.abs(np.corrcoef(drawn.T) - np.eye(7)).max() < 0.07
 
 
+def test_seas_and_jumps_are_drawn_beside_ramps(config: Config) -> None:
+    """A third of the envs each; a step of one jitted program moves all of them."""
+    task = dataclasses.replace(config.task, board_motions=("ramps", "steps", "sea"))
+    env = BalanceEnv(dataclasses.replace(config, task=task))
+    reset = jax.jit(jax.vmap(lambda key: env.reset(key).pipeline_state.scenario))
+    drawn = jax.device_get(reset(jax.random.split(jax.random.PRNGKey(0), RESETS)))
+    assert drawn.waves.amplitude.dtype == np.float32
+    sailing, jumping = drawn.waves.amplitude.any(axis=(1, 2)), drawn.rate == 20
+    for kind in (sailing, jumping):
+        assert kind.mean() == pytest.approx(1 / 3, abs=4 * np.sqrt(2 / 9 / RESETS))
+    assert not drawn.targets[sailing].any()
+    omega = drawn.waves.omega[sailing].ravel()
+    peak = 2 * np.pi / task.sea_period
+    # Half of the energy below 2 w_p lies below this frequency.
+    middle = peak * (1.25 / -np.log(0.5 * np.exp(-1.25 / 16))) ** 0.25
+    assert (omega < middle).mean() == pytest.approx(0.5, abs=0.02)
+    np.testing.assert_allclose(
+        (drawn.waves.amplitude[sailing] ** 2).sum(axis=(1, 2)).std(), 0, atol=1e-5
+    )
+
+
 def test_a_share_of_the_targets_fills_the_square(config: Config) -> None:
     """Beyond 7 deg lie 1 - pi/4 of a square's targets; of two, each is drawn for itself."""
-    targets, _, _ = scenarios(config, 20.0, 0.7)
+    targets = scenarios(config, 20.0, 0.7).targets
     beyond = np.linalg.norm(targets[:, 1:], axis=-1) > 7
     share = 0.7 * (1 - np.pi / 4)
     error = 4 * np.sqrt(share / RESETS)

@@ -7,12 +7,16 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_balance.config import Config, RandomizationConfig, preset
+from mjx_balance.config import Config, ConfigError, RandomizationConfig, preset
 from mjx_balance.envs.batch import Episodes, rows
+from mjx_balance.evaluation.controllers import make_controller
+from mjx_balance.evaluation.rollout import roll_out
 from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
+from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.randomization import DRAWS, draw_params
+from mjx_balance.task.tilt import MOTIONS, board_angle, numpy_uniform
 
 
 def with_task(config: Config, **values: float) -> Config:
@@ -133,10 +137,45 @@ def test_a_board_that_does_not_arrive_is_refused(config: Config) -> None:
         draw(with_task(config, target_period=3.99), "corner", 1, 20, 0)
 
 
+def test_steps_and_sea_have_generators_of_their_own(config: Config) -> None:
+    """So that no draw of another suite changes; a heading of the config holds for all scenarios."""
+    for suite in ("steps", "sea"):
+        own = np.random.default_rng((4, 1, 3))
+        expected = MOTIONS[suite].draw(config.task, 7, numpy_uniform(own))
+        got = rows(draw(config, suite, 2, 60.0, 4).scenario, np.asarray([1]))
+        jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y), got, expected)
+    waves = draw(with_task(config, sea_heading=90.0), "sea", 200, 60.0, 0).scenario.waves
+    assert waves is not None
+    about_x, about_y = waves.amplitude.mean(axis=(0, 1))
+    assert about_x > 0.8 * 4.38 / 8, "waves that run to the left roll the deck"
+    assert abs(about_y) < 0.05
+
+
+def test_a_sea_out_of_bounds_is_refused(config: Config) -> None:
+    with pytest.raises(ConfigError, match=r"sea_angle is 9.0 deg; it must not exceed max_incline"):
+        draw(with_task(config, sea_angle=9.0), "sea", 1, 10, 0)
+
+
+@pytest.mark.parametrize(("suite", "most"), [("steps", 0.3), ("sea", 0.06)])
+def test_the_board_goes_where_the_suite_says(config: Config, suite: str, most: float) -> None:
+    """Its servo is 10 ms late: 0.2 deg at 20 deg/s, 0.035 deg at 3.5; and swings a little."""
+    scene = load_scene(config)
+    episodes = draw(config, suite, 2, 16.0, 1)
+    rollout = roll_out(scene, make_controller("pd-imu", scene), episodes, 16.0, record=True)
+    assert rollout.qpos is not None
+    assert not rollout.fell.any()
+    time = np.tile(scene.task.sim_dt * np.arange(1, 4001), (2, 1))
+    error = np.degrees(rollout.qpos[..., scene.board_qpos]) - board_angle(
+        scene.task, episodes.scenario, time
+    )
+    assert np.abs(board_angle(scene.task, episodes.scenario, time)).max() > 1
+    assert np.abs(error).max() < most
+
+
 def test_impossible_wishes_are_refused(config: Config) -> None:
     with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
         draw(config, "paper", 1, 10, -1)
-    names = "paper, corner, noise, payload, friction, gains, latency, push, fast, steep"
+    names = "paper, corner, noise, payload, friction, gains, latency, push, fast, steep, steps, sea"
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
         draw(config, "moon", 1, 10, 0)
 

@@ -3,6 +3,7 @@
 import dataclasses
 import types
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,15 +11,36 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.task.tilt import Scenario, board_angle, disc_targets, num_targets
+from mjx_balance.config.sea import significant_angle
+from mjx_balance.envs.batch import stacked
+from mjx_balance.task.tilt import (
+    MOTIONS,
+    Scenario,
+    Waves,
+    board_angle,
+    disc_targets,
+    draw_scenario,
+    num_targets,
+    numpy_uniform,
+)
 
 TASK = TaskConfig()
+SEA = dataclasses.replace(TASK, board_motions=("sea",))
 
 
 def random_scenarios(count: int) -> Scenario:
     rng = np.random.default_rng(0)
     targets, phase = rng.uniform(-7, 7, (count, 5, 2)), rng.uniform(0, 10, count)
-    return Scenario(targets, phase, rng.uniform(3, 4, count))
+    rate = rng.uniform(3, 4, count)
+    amplitude, turn = rng.uniform(0, 0.5, (count, 8, 2)), rng.uniform(0, 6, (count, 8, 2))
+    return Scenario(targets, phase, rate, Waves(amplitude, rng.uniform(0.4, 2, (count, 8)), turn))
+
+
+def drawn(task: TaskConfig, count: int = 400, seconds: float = 60.0) -> Scenario:
+    """Scenarios of training."""
+    task = dataclasses.replace(task, episode_length=round(seconds / task.ctrl_dt))
+    rngs = [np.random.default_rng(k) for k in range(count)]
+    return stacked([draw_scenario(task, numpy_uniform(rng)) for rng in rngs])
 
 
 @pytest.mark.parametrize(
@@ -53,10 +75,11 @@ def test_angle_by_hand(
 
 def test_batch_equals_a_loop(xp: types.ModuleType) -> None:
     """Boards differ in targets, phase and speed."""
-    scenarios = Scenario(*map(xp.asarray, random_scenarios(4)))
+    scenarios = jax.tree.map(xp.asarray, random_scenarios(4))
     times = xp.asarray(np.random.default_rng(1).uniform(0, 60, (4, 30)))
     batch = board_angle(TASK, scenarios, times)
-    loop = [board_angle(TASK, Scenario(*(x[k] for x in scenarios)), times[k]) for k in range(4)]
+    each = [jax.tree.map(lambda x: x[k], scenarios) for k in range(4)]  # noqa: B023
+    loop = [board_angle(TASK, one, at) for one, at in zip(each, times, strict=True)]
     np.testing.assert_allclose(batch, np.stack(loop), atol=1e-6)
 
 
@@ -89,7 +112,7 @@ def test_a_turning_target_under_a_rate_limit_gives_the_same_board(data: st.DataO
 def test_jax_agrees_in_float32_to_the_end_of_an_episode() -> None:
     """60 s in float32: a time is good to 4 us, an angle at 4 deg/s to 1e-4 deg."""
     scenarios, times = random_scenarios(8), np.tile(np.arange(0, 60, 0.05), (8, 1))
-    single = Scenario(*(jnp.asarray(x, jnp.float32) for x in scenarios))
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), scenarios)
     got = board_angle(TASK, single, jnp.asarray(times, jnp.float32))
     assert got.dtype == jnp.float32
     np.testing.assert_allclose(got, board_angle(TASK, scenarios, times), atol=2e-4)
@@ -126,3 +149,115 @@ def test_targets_last_for_any_phase_and_none_is_wasted(period: float, steps: int
     assert num_targets(task, steps * 0.004) in (last + 1, last + 2)
     youngest = int(np.floor(before_the_end / period))
     assert num_targets(task, steps * 0.004) == youngest + 2
+
+
+def test_the_sea_has_bretschneiders_spectrum() -> None:
+    """Variance Hs^2 / 16, distributed over frequencies as an integral by numbers says."""
+    task = dataclasses.replace(SEA, sea_angle=3.0, sea_period=9.0)
+    waves = drawn(task).waves
+    assert waves is not None
+    variance = (waves.amplitude**2).sum(axis=(1, 2)) / 2
+    np.testing.assert_allclose(variance, 3.0**2 / 16)
+    peak = 2 * np.pi / 9
+    grid = np.linspace(0.3, 2.0, 20_001) * peak
+    density = 5 / 16 * 3.0**2 * peak**4 / grid**5 * np.exp(-5 / 4 * (peak / grid) ** 4)
+    below = np.append(0.0, np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(grid)))
+    assert below[-1] == pytest.approx(0.925 * 3.0**2 / 16, rel=1e-3), "what is left out"
+    share = np.interp(np.sort(waves.omega.ravel()), grid, below / below[-1])
+    expected = (np.arange(waves.omega.size) + 0.5) / waves.omega.size
+    np.testing.assert_allclose(share, expected, atol=0.01)
+    assert len(np.unique(waves.omega)) == waves.omega.size, "no wave repeats another's"
+
+
+def test_a_long_sea_has_the_variance_of_its_spectrum_over_time() -> None:
+    """Of ten hours, computed as a complex sum, without the beginning."""
+    sea = drawn(dataclasses.replace(SEA, sea_angle=4.0), 1)
+    time = np.arange(20.0, 36_000.0, 0.5)
+    waves = sea.waves
+    assert waves is not None
+    angle = board_angle(SEA, sea, time[None])[0]
+    rotating = np.exp(1j * (time[:, None] * waves.omega[0]))[..., None]
+    by_hand = (rotating * np.exp(1j * waves.phase[0]) * waves.amplitude[0]).sum(axis=1).imag
+    np.testing.assert_allclose(angle, by_hand, atol=1e-9)
+    assert angle.var(axis=0).sum() == pytest.approx(4.0**2 / 16, rel=0.02)
+
+
+def test_directions_spread_about_the_heading_with_the_cosine_squared() -> None:
+    """A sea from astern, to the left by 30 deg: mean of cos(2 d) over cos^2 d is a half."""
+    waves = drawn(dataclasses.replace(SEA, sea_heading=30.0)).waves
+    assert waves is not None
+    about_x, about_y = np.moveaxis(waves.amplitude, -1, 0)
+    heading = np.degrees(np.arctan2(about_x, -about_y)) - 30
+    offset = (heading + 180) % 360 - 180
+    assert np.abs(offset).max() < 90
+    assert offset.mean() == pytest.approx(0, abs=2)
+    assert np.cos(np.radians(2 * offset)).mean() == pytest.approx(0.5, abs=0.04)
+    anywhere = drawn(SEA).waves
+    assert anywhere is not None
+    assert np.abs(anywhere.amplitude.mean(axis=(0, 1))).max() < 0.02
+
+
+@pytest.mark.parametrize("period", [6.0, 10.0, 25.0])
+def test_no_sea_exceeds_the_bounds_of_the_config(period: float) -> None:
+    """Random seas, and the fastest: all waves along one axis, aligned at their steepest."""
+    task = dataclasses.replace(SEA, sea_period=period)
+    height, time = significant_angle(task), np.arange(0, 60, 0.05)
+    seas = drawn(task, 100)
+    angle = board_angle(task, seas, np.tile(time, (100, 1)))
+    assert np.abs(angle).max() <= height <= 7.0
+    assert np.abs(np.diff(angle, axis=1)).max() / 0.05 <= 3.5
+    np.testing.assert_array_equal(angle[:, 0], 0)
+    assert np.abs(angle[:, 1]).max() < 2e-3, "at rest at first"
+    worst = MOTIONS["sea"].draw(
+        dataclasses.replace(task, sea_heading=0.0), 2, lambda shape, low, high: np.zeros(shape)
+    )
+    assert worst.waves is not None
+    steepest = -worst.waves.omega[:, None] * period + np.zeros((8, 2))
+    worst = worst._replace(waves=worst.waves._replace(phase=steepest))
+    turned = board_angle(task, worst, np.arange(0.9, 1.1, 1e-3) * period)
+    rate = np.abs(np.diff(turned, axis=0)).max() / (1e-3 * period)
+    most = min(3.5, 7.0 * 7.9731 / period)
+    assert 0.99 * most < rate <= most
+
+
+def test_waves_tilt_the_board_in_the_direction_in_which_they_run() -> None:
+    """Rotated by the hinges, X outside, the board's surface has the slope of the wave."""
+    task = dataclasses.replace(SEA, sea_heading=70.0)
+    zeros = lambda shape, low, high: np.zeros(shape)  # noqa: E731
+    scenario = MOTIONS["sea"].draw(task, 2, zeros)
+    x, y = np.radians(board_angle(task, scenario, np.asarray([23.0]))[0])
+    normal = np.asarray([np.sin(y), -np.sin(x) * np.cos(y), np.cos(x) * np.cos(y)])
+    slope = -normal[:2] / normal[2]
+    along = np.asarray([np.cos(np.radians(70)), np.sin(np.radians(70))])
+    assert abs(np.cross(slope, along)) < 1e-3 * np.linalg.norm(slope)
+    waves = scenario.waves
+    assert waves is not None
+    size = np.linalg.norm(waves.amplitude, axis=-1)
+    expected = (size * np.sin(waves.omega * 23.0)).sum()
+    assert np.degrees(slope @ along) == pytest.approx(expected, rel=1e-3)
+
+
+def test_jumps_leave_room_before_a_fall() -> None:
+    """Up to 4 deg, two thirds of the limit of 6, at 20 deg/s; then the board rests."""
+    steps = drawn(dataclasses.replace(TASK, board_motions=("steps",), square_share=0.5))
+    assert steps.waves is None
+    np.testing.assert_array_equal(steps.rate, 20.0)
+    jumps = np.linalg.norm(np.diff(steps.targets, axis=1), axis=-1)
+    assert 3.5 < jumps.max() <= 4.0
+    flat = drawn(dataclasses.replace(TASK, board_motions=("steps",), max_incline=1.0))
+    assert 0.9 < np.linalg.norm(flat.targets, axis=-1).max() <= 1.0
+
+
+def test_several_kinds_are_drawn_equally_often() -> None:
+    """Ramps and jumps have calm water, a sea has level targets; ramps alone are as before."""
+    every = drawn(dataclasses.replace(TASK, board_motions=("ramps", "steps", "sea")), 600)
+    assert every.waves is not None
+    sailing, jumping = every.waves.amplitude.any(axis=(1, 2)), every.rate == 20
+    moving = every.targets.any(axis=(1, 2))
+    np.testing.assert_array_equal(sailing, ~moving)
+    assert not (sailing & jumping).any()
+    for kind in (sailing, jumping, moving & ~jumping):
+        assert kind.mean() == pytest.approx(1 / 3, abs=4 * np.sqrt(2 / 9 / 600))
+    ramps, alone = moving & ~jumping, drawn(TASK, 600)
+    np.testing.assert_array_equal(every.targets[ramps], alone.targets[ramps])
+    np.testing.assert_array_equal(every.phase[ramps], alone.phase[ramps])
