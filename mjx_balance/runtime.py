@@ -36,7 +36,8 @@ import numpy as np
 
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts it"
-ACTION = "grid"  #: the only kind of action: a row of `actions.table_m`
+ACTIONS = ("grid", "continuous")
+"""Kinds of commands: rows of `actions.table_m`, or any within their range."""
 SENSORS = ("gyro", "accelerometer")
 ARGUMENTS = ("joint_positions", *SENSORS)  #: of `step`
 IMU = 6  #: gyro x, y and z, accelerometer x, y and z
@@ -132,9 +133,10 @@ class Controller:
         ramp = _whole("ramp_samples", timing["ramp_samples"], 1, self.decision_samples)
         self._share = (np.arange(1, ramp + 1) / ramp)[:, None]
         self._height = _number("body_height_m", manifest["body_height_m"], *legs.height_range)
-        if manifest["action"] != ACTION:
+        action = manifest.get("action", "grid")  # the first files do not say
+        if action not in ACTIONS:
             raise PolicyFileError(
-                f"its action is {_quote(manifest['action'])}; this file runs {ACTION!r}"
+                f"its action is {_quote(action)}; this file runs {' and '.join(ACTIONS)}"
             )
         self._table = _numbers("table_m", manifest["actions"]["table_m"], (None, 2))
 
@@ -149,6 +151,11 @@ class Controller:
         self._network = _Network(manifest["network"], inputs.size, weights)
         if len(self._table) != math.prod(self._network.factors):
             raise PolicyFileError("its action table is not what its network chooses from")
+        self._continuous = action == "continuous"
+        if self._continuous and not (self._network.radial and len(self._network.factors) == 2):
+            raise PolicyFileError("its action is 'continuous', but its network is not radial")
+        low, high = self._table.min(axis=0), self._table.max(axis=0)
+        self._middle, self._half = np.float32((low + high) / 2), np.float32((high - low) / 2)
 
         low, high = legs.limits()
         most = np.repeat((GYRO_MOST, ACCEL_MOST), 3)
@@ -164,7 +171,8 @@ class Controller:
         """Starts again; the robot must stand still at its standing height."""
         self.state = State.STANDING
         self.reason = ""  #: the reason for holding, in a sentence
-        self.action: int | None = None  #: index of the last action
+        self.action: int | None = None  #: index of the last action, or of the nearest on the grid
+        self.command: np.ndarray | None = None  #: its height changes a_x and a_y, m
         self._commands[:] = self._height
         self._path = self._legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]
@@ -338,14 +346,17 @@ class Controller:
 
     def _decide(self, now: float) -> None:
         """Chooses an action, and computes its ramp of targets, `_path`."""
-        self.action = self._network.greedy(self._observation())
+        self.action, best = self._network.greedy(self._observation())
+        command = self._table[self.action].copy()
+        if self._continuous:
+            command = self._middle + self._half * best
         before = self._commands[-1].copy()
-        after = self._legs.moved(before, self._table[self.action])
+        after = self._legs.moved(before, command)
         self._commands[:-1] = self._commands[1:]
         self._commands[-1] = after
         self._path = self._legs.joint_angles(before * (1 - self._share) + after * self._share)
         self._imu[: self._history] = self._imu[-self._history :]
-        self._since, self._decided = 0, now
+        self._since, self._decided, self.command = 0, now, command
 
     def _observation(self) -> np.ndarray:
         return self._inputs.observe(
@@ -466,12 +477,12 @@ class _Network:
 
     def __init__(self, network: Any, inputs: int, weights: dict[str, np.ndarray]) -> None:
         self.factors = _wholes("factors", network["factors"], MOST_FACTORS)
-        self._radial = network["radial"] is True
+        self.radial = network["radial"] is True
         hidden = _wholes("hidden_sizes", network["hidden_sizes"], MOST_LAYERS)
         rows, columns = [inputs, *hidden], [*hidden, sum(self.factors)]
         names = [f"hidden_{k}" for k in range(len(hidden))] + ["head"]
         shapes: dict[str, tuple[int, ...]] = {}
-        if self._radial:
+        if self.radial:
             rows[-1] += inputs
             columns[-1] = 1 + len(self.factors)
             shapes = {"profile": (4,), "stretch": (len(self.factors),)}
@@ -487,20 +498,23 @@ class _Network:
                 raise PolicyFileError(f"weight {name} holds values that are not finite numbers")
         self._layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
 
-    def greedy(self, observation: np.ndarray) -> int:
-        """Index of the best action; raises `_Unsafe` if an output is not finite."""
+    def greedy(self, observation: np.ndarray) -> tuple[int, np.ndarray]:
+        """Index of the best action, and a radial head's best point in the range of its levels.
+
+        The point has a number from -1 to 1 per factor. Raises `_Unsafe` if an output is not finite.
+        """
         with np.errstate(over="ignore", invalid="ignore"):
             obs = x = observation.astype(np.float32)
             for kernel, bias in self._layers[:-1]:
                 x = np.maximum(x @ kernel + bias, 0.0)
             kernel, bias = self._layers[-1]
-            out = (np.concatenate((x, obs)) if self._radial else x) @ kernel + bias
+            out = (np.concatenate((x, obs)) if self.radial else x) @ kernel + bias
         if not np.isfinite(out).all():
             raise _Unsafe("the network gives values that are not finite numbers")
         index = 0
         for k, levels in enumerate(self.factors):
-            index = index * levels + (self._nearest(out, k) if self._radial else self._best(out, k))
-        return index
+            index = index * levels + (self._nearest(out, k) if self.radial else self._best(out, k))
+        return index, np.clip(out[1 : 1 + len(self.factors)], -1, 1)
 
     def _nearest(self, out: np.ndarray, axis: int) -> int:
         """The level nearest to the best point of a radial head, whose outputs are V and mu."""

@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -52,6 +52,9 @@ class ControllerArgs:
     robot: str | None = None
     """Robot of the baseline, or of a policy whose robot is not shipped: TOML file or
     menagerie:NAME."""
+    action: Literal["grid", "continuous"] | None = None
+    """Command height changes of the grid, or any up to its greatest; none: as the policy was
+    trained, and the grid for a baseline."""
 
     def load(self) -> tuple[Scene, Controller]:
         """Loads the policy or builds the baseline, and its scene.
@@ -63,6 +66,12 @@ class ControllerArgs:
             raise ControllerError("name a policy file or --controller NAME, one of the two")
         if self.policy is not None:
             policy = load_policy(self.policy)
+            if self.action is not None:
+                policy = policy.with_action(self.action)
             return rollout.policy_scene(policy, robot=self.robot), rollout.observing(policy)
-        scene = load_scene(check(for_robot(preset("default"), self.robot or "quadruped")))
+        config = for_robot(preset("default"), self.robot or "quadruped")
+        if self.action is not None:
+            task = dataclasses.replace(config.task, action=self.action)
+            config = dataclasses.replace(config, task=task)
+        scene = load_scene(check(config))
         return scene, make_controller(str(self.controller), scene)

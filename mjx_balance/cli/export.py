@@ -41,7 +41,7 @@ def _write_onnx(name: Path, out: Path) -> int:
     print(f"{shorten(out, PATH)}: {size / 1000:,.1f} kB, opset {OPSET}")
     print(
         f"observation (N, {policy.observation_size}) float32 -> "
-        f"q_values (N, {len(policy.actions)}) float32, action (N,) int64"
+        f"q_values (N, {len(policy.actions)}) float32, action (N,) int64, command (N, 2) float32"
     )
     return 0
 

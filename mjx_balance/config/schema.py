@@ -77,6 +77,9 @@ class TaskConfig:
     """Greatest height change of one decision on one axis, m (paper Eq. 3)."""
     action_levels: Annotated[int, Ge(3), Le(201)] = 21
     """Height changes per axis (paper Eq. 3: n = 0..20)."""
+    action: Literal["grid", "continuous"] = "grid"
+    """What policies and baselines command: the grid's height changes (paper Eq. 3), or any up to
+    action_max, for which a policy needs the head "radial"."""
     action_ramp: Annotated[float, Gt(0), Le(1)] = 0.1
     """Share of a decision in which the legs move to their new heights (chosen: the legs are at
     rest before the next decision, and the gyro reads the board's rate; benchmarks/README.md)."""

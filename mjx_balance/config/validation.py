@@ -97,6 +97,11 @@ def _check_inputs(task: TaskConfig) -> None:
 
 def _check_learning(config: Config) -> None:
     dqn, num_envs = config.dqn, config.num_envs
+    if config.task.action == "continuous" and dqn.head != "radial":
+        raise ConfigError(
+            f"action is 'continuous', but head is {quote(dqn.head)}, which has values of the "
+            "grid's actions only; action must be 'grid', or head 'radial'"
+        )
     if dqn.min_replay_size > dqn.replay_capacity:
         raise ConfigError(
             f"min_replay_size is {dqn.min_replay_size}; it must not exceed replay_capacity, "

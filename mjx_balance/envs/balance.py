@@ -60,8 +60,8 @@ class BalanceEnv(Env):
         Raises:
           ConfigError: if the config cannot be run, or for another kind of action.
         """
-        self._discrete = check_action(action) == "discrete"
         self.config = check(config or preset("default"))
+        self._discrete = check_action(action, self.config.task) == "discrete"
         self.scene = load_scene(self.config)
         self.engine = make_engine(self.config, self.scene)
         self._table = action_table(self.config.task)

@@ -54,7 +54,7 @@ class _Balance:
         self,
         preset: str | None = None,
         config: Config | None = None,
-        action: str = "discrete",
+        action: str | None = None,
         render_mode: str | None = None,
         robot: str | None = None,
     ):
@@ -64,7 +64,7 @@ class _Balance:
           preset: name of the config; "default" if neither is given.
           config: instead of preset and robot; its task, robot and randomisation count.
           action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
-            `action_max`, -1 to 1.
+            `action_max`, -1 to 1; None: as the config's `task.action`.
           render_mode: "human", a window in which every decision takes its time (one env only);
             "rgb_array"; or None.
           robot: as `Config.robot`, for which the preset is adapted; our own if None.
@@ -87,7 +87,8 @@ class _Balance:
         task = self.config.task
         self.max_episode_steps = task.episode_length
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
-        self._table = action_table(task) if check_action(action) == "discrete" else None
+        discrete = check_action(action, task) == "discrete"
+        self._table = action_table(task) if discrete else None
         shares = spaces.Box(-1, 1, (2,), np.float32)
         single = shares if self._table is None else spaces.Discrete(len(self._table))
         self.action_space = self.single_action_space = single
@@ -248,7 +249,7 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):  #
         num_envs: int = 1,
         preset: str | None = None,
         config: Config | None = None,
-        action: str = "discrete",
+        action: str | None = None,
         render_mode: str | None = None,
         robot: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,

@@ -1,8 +1,9 @@
 """Controllers: what one sees, and classical ones to compare a policy with. No JAX.
 
-The baselines act through the policy's own action set. `pd-imu` sees what the policy
-sees. The others cheat, each with more knowledge, and bound what any controller can do
-with these actions at this rate.
+The baselines act through the policy's own action set: the grid, or with `task.action`
+"continuous" any height change up to its greatest. `pd-imu` sees what the policy sees. The
+others cheat, each with more knowledge, and bound what any controller can do with these
+actions at this rate.
 """
 
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from mjx_balance.envs.batch import BatchEnv, Episodes
 from mjx_balance.errors import InputError
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task import tilt
-from mjx_balance.task.actions import nearest_action
+from mjx_balance.task.actions import to_command
 from mjx_balance.task.attitude import roll_pitch
 
 HORIZON = 8  #: decisions that the predictive controllers look ahead
@@ -71,8 +72,7 @@ def attitude(scene: Scene, view: View) -> np.ndarray:
 
 def stand(scene: Scene) -> Controller:
     """Never moves."""
-    action = nearest_action(scene.task, np.zeros(ACTION_AXES))
-    return lambda view: np.full(len(view.ids), action)
+    return lambda view: np.zeros((len(view.ids), ACTION_AXES))
 
 
 class AttitudePD:
@@ -91,10 +91,10 @@ class AttitudePD:
         self.gain = measure_response(scene).gain
 
     def __call__(self, view: View) -> np.ndarray:
-        """Returns action indices (n,)."""
+        """Returns commands (n, 2), m."""
         angle, speed = self.state(view)
         change = -(self.proportional * angle + self.rate * speed) / self.gain
-        return nearest_action(self.task, change)
+        return to_command(self.task, change)
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Roll and pitch (n, 2), deg, and their rates (n, 2), deg/s."""
@@ -170,7 +170,7 @@ class Predictive:
         self.chosen = np.zeros((2, 0, ACTION_AXES))
 
     def __call__(self, view: View) -> np.ndarray:
-        """Returns action indices (n,)."""
+        """Returns commands (n, 2), m."""
         task, n = self.task, len(view.ids)
         if view.env_steps == 0:
             self.chosen = np.zeros((2, view.ids.max() + 1, ACTION_AXES))
@@ -197,7 +197,7 @@ class Predictive:
                 plan[..., j] = np.where(fixed, plan[..., j], np.clip(moved, -limit, limit))
         choice = np.where(delayed, plan[..., 1], plan[..., 0])
         self.chosen[:, view.ids] = newer, choice
-        return nearest_action(task, choice / self.gain)
+        return to_command(task, choice / self.gain)
 
 
 def at_this_rate(task, scenario: tilt.Scenario, now: np.ndarray, ahead: np.ndarray) -> np.ndarray:

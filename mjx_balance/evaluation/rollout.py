@@ -37,7 +37,7 @@ class EvaluationError(InputError):
 
 def observing(policy: Policy) -> Controller:
     """The policy as a controller: it looks at the observation alone."""
-    return lambda view: policy(view.obs)
+    return lambda view: policy.command(view.obs)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -82,6 +82,14 @@ class Radial:
         digits = xp.nan_to_num(nearest).astype(np.int32)
         return _index([digits[..., k] for k in range(len(self.factors))], self.factors)
 
+    def peak(self) -> Any:
+        """The best point within the grid's range, (..., len(factors)), -1 to 1.
+
+        `argmax` is the grid's point nearest to it, also where mu is NaN: there it is -1.
+        """
+        xp = self.out.__array_namespace__()
+        return xp.clip(xp.nan_to_num(self.out[..., 1:], nan=-1.0), -1, 1)
+
 
 Head = Additive | Radial
 

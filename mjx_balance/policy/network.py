@@ -1,13 +1,16 @@
 """The Q-network of an exported policy in NumPy."""
 
+import copy
+import dataclasses
 import hashlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
+from mjx_balance.config import check, to_dict
 from mjx_balance.policy import heads
-from mjx_balance.policy.manifest import PolicyError, network_factors, read_manifest
+from mjx_balance.policy.manifest import PolicyError, describe, network_factors, read_manifest
 from mjx_balance.task.actions import action_table
 from mjx_balance.text import quote
 
@@ -76,6 +79,38 @@ class Policy:
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """Index of the best action: () for (obs_size,), (batch,) for (batch, obs_size)."""
         return self._head(obs).argmax()
+
+    def command(self, obs: np.ndarray) -> np.ndarray:
+        """The height changes a_x and a_y that the policy commands, m.
+
+        With `config.task.action` "grid" they are the best action's; with "continuous" those of the
+        best point, of which the best action is the nearest on the grid.
+
+        Args:
+          obs: (obs_size,) or (batch, obs_size) scaled observations.
+
+        Returns:
+          (2,) or (batch, 2) float32, within the range of `actions`.
+
+        Raises:
+          ValueError: if obs has another size.
+        """
+        head = self._head(obs)
+        if self.config.task.action == "continuous" and isinstance(head, heads.Radial):
+            return head.peak() * self.actions.max(axis=0)
+        return self.actions[head.argmax()]
+
+    def with_action(self, action: str) -> Self:
+        """The same weights as a policy of another `config.task.action`: "grid" or "continuous".
+
+        Raises:
+          ConfigError: for another word, or a head that has values of the grid's actions only.
+        """
+        other, task = copy.copy(self), dataclasses.replace(self.config.task, action=action)
+        other.config = check(dataclasses.replace(self.config, task=task))
+        parts = {"config": to_dict(other.config), **describe(other.config, self.robot)}
+        other.manifest = self.manifest | parts
+        return other
 
     def _head(self, obs: np.ndarray) -> heads.Head:
         obs = x = np.asarray(obs, np.float32)

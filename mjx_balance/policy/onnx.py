@@ -22,7 +22,8 @@ OPSET = 17
 IR_VERSION = 8  #: the version that goes with opset 17; a higher one would exclude older runtimes
 ABOUT = (
     "Greedy policy of mjx_balance. The metadata's inputs say what each entry of the observation "
-    "is, in order; the action is a row of actions.table_m in the metadata's manifest."
+    "is, in order; the action is a row of actions.table_m in the metadata's manifest, the command "
+    "the height changes to make, m."
 )
 
 
@@ -48,8 +49,9 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
     """Returns a policy as a checked ONNX model.
 
     Its input is `observation` (N, obs_size) float32; its outputs are `q_values` (N, num_actions)
-    float32 and `action` (N,) int64, for any N. The metadata holds `manifest` and `inputs` as JSON.
-    The action is valid for any observation, even one that is not finite.
+    float32, `action` (N,) int64, and `command` (N, 2) float32, m, which is `Policy.command`, for
+    any N. The metadata holds `manifest` and `inputs` as JSON. Action and command are valid for any
+    observation, even one that is not finite.
     """
     graph = _Graph()
     x = "observation"
@@ -63,15 +65,22 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
     graph.add("Identity", values, output="q_values")
     index = graph.add("Mul", digits, np.asarray(strides))
     graph.add("ReduceSum", index, np.asarray([1]), keepdims=0, output="action")
+    if policy.config.task.action == "continuous":
+        graph.add("Mul", _peak(graph, out, policy), policy.actions.max(axis=0), output="command")
+    else:
+        graph.add("Gather", policy.actions, "action", output="command")
 
     sizes = {"observation": policy.observation_size, "q_values": len(policy.actions)}
+    sizes["command"] = policy.actions.shape[-1]
     floats = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, ("N", size))
         for name, size in sizes.items()
     ]
     action = helper.make_tensor_value_info("action", TensorProto.INT64, ("N",))
     model = helper.make_model(
-        helper.make_graph(graph.nodes, "policy", floats[:1], [floats[1], action], graph.constants),
+        helper.make_graph(
+            graph.nodes, "policy", floats[:1], [floats[1], action, floats[2]], graph.constants
+        ),
         producer_name="mjx_balance",
         producer_version=installed_version("mjx_balance") or "",
         doc_string=ABOUT,
@@ -148,3 +157,11 @@ def _radial(graph: _Graph, out: str, policy: Policy) -> tuple[str, str]:
     at = graph.add("Where", graph.add("IsNaN", at), zero, at)
     nearest = graph.add("Min", graph.add("Max", graph.add("Round", at), zero), last)
     return values, graph.add("Cast", nearest, to=TensorProto.INT64)
+
+
+def _peak(graph: _Graph, out: str, policy: Policy) -> str:
+    """The best point within the grid's range, as `heads.Radial.peak`."""
+    low, high = np.float32(-1), np.float32(1)
+    mu = graph.columns(out, 1, 1 + len(policy.factors))
+    mu = graph.add("Where", graph.add("IsNaN", mu), low, mu)
+    return graph.add("Min", graph.add("Max", mu, low), high)

@@ -11,8 +11,10 @@ from mjx_balance.text import quote
 ACTIONS = ("discrete", "continuous")  #: table index; shares of `action_max`, -1 to 1
 
 
-def check_action(kind: str) -> str:
-    """Returns one of `ACTIONS`; raises `ConfigError` for anything else."""
+def check_action(kind: str | None, task: TaskConfig) -> str:
+    """Returns one of `ACTIONS`, for None that of `task.action`; raises `ConfigError` for others."""
+    if kind is None:
+        return ACTIONS[task.action == "continuous"]
     if kind not in ACTIONS:
         raise ConfigError(f"action is {quote(kind)}; it must be one of {', '.join(ACTIONS)}")
     return kind
@@ -31,6 +33,16 @@ def nearest_action(task: TaskConfig, change: Float[Array, "*batch 2"]) -> Int[Ar
     step = 2 * task.action_max / (task.action_levels - 1)
     level = np.clip(np.rint((change + task.action_max) / step), 0, task.action_levels - 1)
     return (level[..., 0] * task.action_levels + level[..., 1]).astype(int)
+
+
+def to_command(task: TaskConfig, change: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    """The command, m, for a desired height change of any size, m, as `task.action` allows.
+
+    "grid": the nearest of the table's; "continuous": the change itself, within their range.
+    """
+    if task.action == "grid":
+        return action_table(task)[nearest_action(task, change)]
+    return np.clip(change, -task.action_max, task.action_max)
 
 
 def leg_signs(robot: Robot) -> Float32[np.ndarray, "2 legs"]:

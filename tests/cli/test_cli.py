@@ -20,7 +20,7 @@ from mjx_balance.cli.common import ControllerArgs
 from mjx_balance.config import ConfigError, preset, to_dict
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.errors import FAILED
-from mjx_balance.evaluation.controllers import make_controller
+from mjx_balance.evaluation.controllers import View, make_controller
 from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked, write_json
 from mjx_balance.policy.file import PolicyError, load_policy
@@ -205,6 +205,7 @@ def test_what_cannot_be_resumed_is_refused(
         ("evaluate --controller none --seed -1", "seed is -1"),
         ("evaluate --controller none --scenarios 0", "scenarios is 0"),
         ("evaluate --controller none --duration 1e12", "duration 1e+12 s: that takes about"),
+        ("evaluate best --action both", "invalid choice 'both'"),
         ("evaluate --controller pd-imu --robot rex", "robot is 'rex'"),
         ("report", "name at least one run folder"),
         ("report .", ". is no run folder: it has none of config.json"),
@@ -290,6 +291,25 @@ def test_an_evaluation_is_of_what_was_asked_for(
         ("push", 3, 5.0, 7, False),
         ("push", 1, 5.0, 7, True),
     ]
+
+
+@pytest.mark.parametrize("who", [{"policy": Path("best")}, {"controller": "pd-imu"}], ids=str)
+def test_policies_and_baselines_leave_the_grid_if_asked_to(who: dict[str, Any]) -> None:
+    """In 1 s of suite corner: whole multiples of 0.3 mm, or anything between them."""
+    remainders = {}
+    for action in (None, "grid", "continuous"):
+        scene, controller = ControllerArgs(**who, action=action).load()
+        seen: list[np.ndarray] = []
+
+        def watch(view: View) -> np.ndarray:
+            seen.append(controller(view))  # noqa: B023
+            return seen[-1]  # noqa: B023
+
+        run_suite(scene, watch, "corner", 2, 1.0, 5)
+        levels = 1000 * np.asarray(seen) / 0.3
+        assert np.abs(levels).max() < 10.001
+        remainders[action] = np.abs(levels - np.rint(levels)).max()
+    assert remainders[None] == remainders["grid"] < 1e-4 < 0.3 < remainders["continuous"]
 
 
 def test_a_baseline_stands_on_the_robot_asked_for_as_high_as_it_should() -> None:

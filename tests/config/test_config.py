@@ -244,6 +244,11 @@ def test_every_number_has_its_bounds_tested() -> None:
         ({"gamma": 1.5}, "^gamma is 1.5; it must be at most 1$"),
         ({"payload_height": 1e300}, "payload_height is 1e.300; it must be less than"),
         ({"reward_tilt": "middle"}, "reward_tilt is 'middle'; it must be one of end, mean"),
+        ({"action": "both"}, "action is 'both'; it must be one of grid, continuous"),
+        (
+            {"action": "continuous", "head": "joint"},
+            "action is 'continuous', but head is 'joint', .*; action must be 'grid', or head 'rad",
+        ),
         ({"head": "round"}, "head is 'round'; it must be one of joint, factored, radial"),
         ({"export": "first"}, "export is 'first'; it must be one of last, best"),
         ({"export": "best", "eval_every": 0}, "export is 'best', but eval_every is 0"),

@@ -1,5 +1,6 @@
 """Baselines: each does what its knowledge allows."""
 
+import dataclasses
 import sys
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
-from mjx_balance.config import Config, TaskConfig
+from mjx_balance.config import TaskConfig
 from mjx_balance.evaluation.controllers import (
     CONTROLLERS,
     HORIZON,
@@ -25,7 +26,7 @@ from mjx_balance.evaluation.controllers import (
 from mjx_balance.evaluation.rollout import run_suite, summarize
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task.actions import action_table
+from mjx_balance.task.actions import to_command
 from mjx_balance.task.tilt import Scenario
 
 
@@ -53,9 +54,13 @@ def make_view(
     return view._replace(**more)
 
 
+def off_the_grid(scene: Scene) -> Scene:
+    return dataclasses.replace(scene, task=dataclasses.replace(scene.task, action="continuous"))
+
+
 def test_standing_still_is_the_action_that_changes_nothing(scene: Scene) -> None:
     view = make_view(scene, np.full((3, 3), 5.0))
-    assert make_controller("none", scene)(view).tolist() == [220, 220, 220]
+    assert make_controller("none", scene)(view).tolist() == [[0, 0]] * 3
 
 
 def test_proportional_and_derivative_by_hand(scene: Scene) -> None:
@@ -70,10 +75,25 @@ def test_proportional_and_derivative_by_hand(scene: Scene) -> None:
         np.asarray([(0.4, -0.2, 0.0), (0.4, -0.2, 130.0), (0, 0, 0)]),
         np.asarray([(1.0, 0.5, 9.0), (1.0, 0.5, 9.0), (0, 0, 9.0)]),
     )
-    assert controller(view).tolist() == [21 * 5 + 8, 21 * 5 + 8, 220]
+    expected = [(-1.5, -0.6), (-1.5, -0.6), (0, 0)]
+    np.testing.assert_allclose(1000 * controller(view), expected, atol=1e-5)
+    off_grid = AttitudePD(off_the_grid(scene))
+    off_grid.gain = np.asarray((400.0, -300.0))
+    expected = [(-1.6, -0.6667), (-1.6, -0.6667), (0, 0)]
+    np.testing.assert_allclose(1000 * off_grid(view), expected, atol=1e-4)
+    off_grid.gain = np.asarray((40.0, -30.0))  # -16 and -6.67 mm: more than the greatest
+    np.testing.assert_allclose(1000 * off_grid(view)[0], (-3, -3), atol=1e-9)
     angle, rate = controller.state(view)
     np.testing.assert_allclose(angle[1], (0.4, -0.2), atol=1e-9)
     np.testing.assert_allclose(rate[1], (1.0, 0.5), atol=1e-9)
+
+
+def test_off_the_grid_only_the_greatest_change_bounds_a_command() -> None:
+    """The preset's 3 mm, and no other robot's."""
+    for most in (0.003, 0.001):
+        task = TaskConfig(action="continuous", action_max=most)
+        got = to_command(task, np.asarray([(0.00071, -0.00049), (0.02, -0.02)]))
+        np.testing.assert_allclose(got, [(0.00071, -0.00049), (most, -most)], rtol=1e-12)
 
 
 def test_gains_are_those_that_the_benchmark_found_best(scene: Scene) -> None:
@@ -84,7 +104,7 @@ def test_gains_are_those_that_the_benchmark_found_best(scene: Scene) -> None:
     other = AttitudePD(scene, proportional=0.5, rate=0.2)
     other.gain = np.asarray((400.0, -300.0))
     view = make_view(scene, np.asarray([(0.4, 0.0, 0.0)]), np.asarray([(1.0, 0.0, 0.0)]))
-    assert other(view).tolist() == [21 * 7 + 10]
+    np.testing.assert_allclose(1000 * other(view), [(-0.9, 0)], atol=1e-5)
 
 
 def test_complementary_filter_sample_by_sample(scene: Scene) -> None:
@@ -141,12 +161,12 @@ def best_plan(
     return np.append(fixed, rest)
 
 
-@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize(("late", "off"), [(False, False), (True, False), (True, True)])
 def test_plans_are_the_least_squares_optimum(
-    config: Config,
     scene: Scene,
     courses: tuple[np.ndarray, np.ndarray],
     late: bool,
+    off: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Three decisions of a world that is tilted, turned by 30 deg, and whose board moves.
@@ -156,7 +176,7 @@ def test_plans_are_the_least_squares_optimum(
     """
     monkeypatch.setattr(sys.modules[Predictive.__module__], "SWEEPS", 400)
     gain, course = courses
-    controller = Predictive(scene, as_it_will_be)
+    controller = Predictive(off_the_grid(scene) if off else scene, as_it_will_be)
     limits = np.abs(gain) * 0.003
     scenario = Scenario(np.asarray([[(5.0, -3.0), (5.0, -3.0)]]), np.zeros(1), np.full(1, 3.5))
     taken = [np.zeros(2)]  # in the order in which they act
@@ -169,7 +189,6 @@ def test_plans_are_the_least_squares_optimum(
             scenario=scenario,
             delayed=np.asarray([late]),
         )
-        action = controller(view)
         step = np.arange(1, 401)
         start = 0.2 * decision
         # From 0 at 3.5 deg/s to 5 and -3 deg; heading 30 deg: roll and pitch see it turned.
@@ -188,19 +207,19 @@ def test_plans_are_the_least_squares_optimum(
         taken.append(waiting if late else chosen)
         waiting = chosen
         expected = chosen / gain
-        got = action_table(config.task)[action[0]]
-        np.testing.assert_allclose(got, expected, atol=0.00016)
+        got = controller(view)[0]
+        np.testing.assert_allclose(got, expected, atol=1e-6 if off else 0.00016)
         np.testing.assert_allclose(controller.chosen[1, 0], chosen, atol=1e-4)
 
 
 def test_a_tilt_within_one_action_is_taken_back_at_once(
-    config: Config, scene: Scene, courses: tuple[np.ndarray, np.ndarray]
+    scene: Scene, courses: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """On a board at rest: the height change that undoes 0.5 deg of roll and 0.3 of pitch."""
     gain, _ = courses
     controller = Predictive(scene, at_this_rate)
     tilted = np.asarray([(0.5, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 45.0)])
-    got = action_table(config.task)[controller(make_view(scene, tilted))]
+    got = controller(make_view(scene, tilted))
     expected = [(-0.5 / gain[0], 0.0), (0.0, -0.3 / gain[1]), (0.0, 0.0)]
     np.testing.assert_allclose(got, expected, atol=0.0004)
 

@@ -1,5 +1,6 @@
 """The ONNX model: what NumPy computes, under onnxruntime; written whole or not at all."""
 
+import dataclasses
 import json
 import os
 import sys
@@ -24,7 +25,7 @@ from mjx_balance.policy.network import Policy
 from mjx_balance.policy.onnx import IR_VERSION, OPSET, onnx_model
 
 SHIPPED = Path(__file__).parents[2] / "policies" / "best.safetensors"
-NAMES = ["shipped", *HEADS]
+NAMES = ["shipped", *HEADS, "off the grid"]
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +47,10 @@ def make_policy(name: str) -> Policy:
     """The shipped policy, or one of the same inputs and a head whose weights are all random."""
     if name == "shipped":
         return load_policy(SHIPPED)
-    config = with_head(preset("best"), name)
+    config = with_head(preset("best"), name if name in HEADS else "radial")
+    if name not in HEADS:
+        task = dataclasses.replace(config.task, action="continuous", action_max=0.004)
+        config = dataclasses.replace(config, task=task)
     manifest = make_manifest(config, "0" * 16, {"seed": 5})
     return Policy(manifest, flat_weights(random_params(config)))
 
@@ -61,7 +65,7 @@ def session(model: bytes) -> onnxruntime.InferenceSession:
 def running(policy: Policy) -> Callable[[np.ndarray], Any]:
     """A policy's model under onnxruntime: observations to action values and actions."""
     runtime = session(onnx_model(policy).SerializeToString())
-    return lambda obs: runtime.run(["q_values", "action"], {"observation": obs})
+    return lambda obs: runtime.run(["q_values", "action", "command"], {"observation": obs})
 
 
 @pytest.fixture(params=NAMES)
@@ -74,19 +78,21 @@ def test_values_and_actions_equal_numpys(policy: Policy, observations: np.ndarra
     assert observations.shape == (1_000, 136)
     expected, chosen = policy.q_values(observations), policy(observations)
     assert len(np.unique(chosen)) > 20, "the policy does choose"
-    values, actions = running(policy)(observations)
+    values, actions, commands = running(policy)(observations)
     assert (values.dtype, actions.dtype) == (np.float32, np.int64)
     assert (values.shape, actions.shape) == ((1_000, 441), (1_000,))
     np.testing.assert_allclose(values, expected, rtol=0, atol=1e-5)
     np.testing.assert_array_equal(actions, chosen)
-    alone, action = running(policy)(observations[:1])
+    assert (commands.dtype, commands.shape) == (np.float32, (1_000, 2))
+    np.testing.assert_allclose(commands, policy.command(observations), rtol=0, atol=1e-8)
+    alone, action, _ = running(policy)(observations[:1])
     np.testing.assert_allclose(alone, expected[:1], rtol=0, atol=1e-5)
     assert action.tolist() == chosen[:1].tolist()
 
 
 def test_no_observation_gives_no_action(policy: Policy) -> None:
-    values, action = running(policy)(np.zeros((0, 136), np.float32))
-    assert (values.shape, action.shape) == ((0, 441), (0,))
+    values, action, command = running(policy)(np.zeros((0, 136), np.float32))
+    assert (values.shape, action.shape, command.shape) == ((0, 441), (0,), (0, 2))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, -1e30])
@@ -97,9 +103,13 @@ def test_a_broken_sensor_gets_an_action_of_the_table(
     spoilt = observations[:137].copy()
     np.fill_diagonal(spoilt[1:], value)
     spoilt[0] = value
-    _, action = running(policy)(spoilt)
+    _, action, command = running(policy)(spoilt)
     assert action.min() >= 0
     assert action.max() < 441
+    with np.errstate(all="ignore"):
+        np.testing.assert_allclose(command[1:], policy.command(spoilt[1:]), rtol=0, atol=3e-4)
+    step = policy.actions[1, 1] - policy.actions[0, 1]
+    np.testing.assert_allclose(command, policy.actions[action], rtol=0, atol=0.501 * step)
 
 
 def test_equal_values_give_numpys_choice() -> None:
@@ -112,7 +122,7 @@ def test_equal_values_give_numpys_choice() -> None:
         if name == "radial":
             policy.layers[-1][1][1:] = (0.05, 0.15)
         obs = np.ones((1, 136), np.float32)
-        _, action = running(policy)(obs)
+        _, action, _ = running(policy)(obs)
         expected = {"joint": 0, "factored": 0, "radial": 21 * 10 + 12}[name]
         assert action[0] == policy(obs)[0] == expected
 
@@ -123,9 +133,10 @@ def test_file_says_what_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     output = capsys.readouterr().out.splitlines()
     assert output == [
         f"{file}: {file.stat().st_size / 1000:.1f} kB, opset 17",
-        "observation (N, 136) float32 -> q_values (N, 441) float32, action (N,) int64",
+        "observation (N, 136) float32 -> q_values (N, 441) float32, action (N,) int64, "
+        "command (N, 2) float32",
     ]
-    assert file.stat().st_size < 110_000
+    assert file.stat().st_size < 115_000
     assert os.listdir(tmp_path) == ["policy.onnx"]
     policy = load_policy(SHIPPED)
     runtime = session(file.read_bytes())
@@ -140,6 +151,7 @@ def test_file_says_what_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         ("observation", ["N", 136], "tensor(float)"),
         ("q_values", ["N", 441], "tensor(float)"),
         ("action", ["N"], "tensor(int64)"),
+        ("command", ["N", 2], "tensor(float)"),
     ]
     model = onnx.load(file)
     onnx.checker.check_model(model, full_check=True)
