@@ -199,6 +199,9 @@ def test_what_is_said_of_a_policy_is_said_of_its_own_task(policy: Policy) -> Non
     assert "<span>mean tilt, both axes at 5.5° at once" in text
     assert "from a fall on it counts as 8°. All take the same 11 x 11 actions at 2.5 Hz" in text
     assert "cannot follow: 2.5 mm 2.5 times a second turn the body" in text
+    policy = policy.with_action("continuous")
+    text = shown(policy)
+    assert "All take any height changes up to 2.5 mm, off the grid, at 2.5 Hz" in text
 
 
 def test_the_pictures_of_a_policy(
