@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.robots.measure import JOINT_ACTUATORS, check_joints, measure, pose
+from mjx_balance.robots.measure import check_joints, measure, pose
 from mjx_balance.robots.model import FRESH, Coupling, compile_model, model_path, naming, read_model
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import FixedJoint, Foot, LegFile, RobotError, RobotFile
@@ -112,13 +112,17 @@ def _find(elements: list, name: str, what: str, kind: str):
 
 def _leave_robot(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> None:
     """Removes everything but the robot's bodies, joints and geoms."""
-    for actuator in list(spec.actuators):
-        if actuator.trntype not in JOINT_ACTUATORS or spec.joint(actuator.target) is None:
-            spec.delete(actuator)
     world = spec.worldbody
     around = [body for body in world.bodies if body.name != trunk.name]
     for element in (*around, *world.geoms, *world.sites):
         spec.delete(element)
+    _drop_idle(spec)
+
+
+def _drop_idle(spec: mujoco.MjSpec) -> None:
+    """Removes the actuators of joints that were removed."""
+    for actuator in [x for x in spec.actuators if spec.joint(x.target) is None]:
+        spec.delete(actuator)
 
 
 def strip_elements(spec: mujoco.MjSpec, strip: Iterable[str | FixedJoint], trunk: str = "") -> None:
@@ -158,6 +162,7 @@ def strip_elements(spec: mujoco.MjSpec, strip: Iterable[str | FixedJoint], trunk
                 spec.delete(element)
         if name == "world" or not (fixed or free_joints()):
             raise RobotError(f"strip names {quote(name)}, which is, or carries, the trunk")
+    _drop_idle(spec)
 
 
 def _move(spec: mujoco.MjSpec, fixed: FixedJoint) -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +28,8 @@ is nearer is no foot."""
 SIZES = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  #: positions of a joint
 NAMELESS, MISSING = "?", ('["ABDUCTION", "HIP", "KNEE"]', '"FOOT"')
 GIVE = "give it one in its model, for the file to use"
+ENDS = {"front": "front|fore|f[lr]|[lr]f", "hind": "rear|hind|back|[rhb][lr]|[lr][hb]"}
+"""What names of joints call the ends of a robot, as words of their own."""
 CORNERS = {"FL": "front left", "FR": "front right", "RL": "rear left", "RR": "rear right"}
 
 
@@ -93,13 +96,17 @@ def _sketch(model: str, path: Path, strip: Sequence[str]) -> tuple[str, list[str
     spec = read_model(path, strip=take_out).spec
     problems = []
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints):
-        root = max(spec.worldbody.bodies, key=lambda x: len(x.find_all("body")), default=None)
+        roots = spec.worldbody.bodies
+        root = max(roots, key=lambda x: len(x.find_all("body")), default=None)
         if root is None:
             raise RobotError(f"{path.name} has no body")
-        problems.append(
-            f"{path.name} has no free joint; its trunk must be free to move: write <freejoint/> "
-            f"into its body {quote(root.name)}, in place of joints that it has"
-        )
+        inside = f"write <freejoint/> into its body {quote(root.name)}, in place of joints it has"
+        if root.joints and path.suffix.lower() == ".urdf":
+            name = root.joints[0].name.removesuffix("_TX")  # MuJoCo's for a planar joint's first
+            inside = f"leave out its joint {quote(name)}, or make it floating"
+        elif sum(bool(x.joints) for x in roots) > 3:
+            inside = f"put its bodies, such as {quote(root.name)}, into one with a <freejoint/>"
+        problems.append(f"{path.name} has no free joint; its trunk must be free to move: {inside}")
         for joint in root.joints:
             spec.delete(joint)
         root.add_freejoint()
@@ -107,11 +114,17 @@ def _sketch(model: str, path: Path, strip: Sequence[str]) -> tuple[str, list[str
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
     free = compiled.jnt_bodyid[compiled.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
-    trunk = int(free[np.argmax(compiled.body_subtreemass[free])])
+    trunk = max(free.tolist(), key=lambda body: _legs_and_mass(compiled, body))
     legs = _legs(compiled, data, trunk, path, problems)
     text = _render(compiled, data, model, trunk, legs, strip, places, problems)
     mend = "".join(f"# To mend: {problem}.\n" for problem in problems)
     return HEADER + mend + text, problems
+
+
+def _legs_and_mass(model: mujoco.MjModel, body: int) -> tuple[int, float]:
+    """What tells a robot from what lies about: the number of its legs, four at most, then mass."""
+    chains = sum(limb.chain for limb in _limbs(model, body))
+    return min(chains, 4), float(model.body_subtreemass[body])
 
 
 def _places(spec: mujoco.MjSpec) -> dict[str, float]:
@@ -147,7 +160,7 @@ def _legs(
             raise RobotError(f"{problem}, and no other joint; it is no legged robot")
         other = max((x.joints for x in limbs if not x.chain), key=len, default=[])
         remedy = "a robot of this kind has four legs of three: abduction, hip, knee"
-        if len(other) > 3:
+        if sum(len(x.joints) >= 3 for x in limbs) >= 4:
             remedy = "fix joints, or leave bodies out, by `robot new --strip NAME`"
         limb = f", and a limb of {_names(model, other)}" if other else ""
         problems.append(f"{problem}{limb}; {remedy}")
@@ -268,18 +281,37 @@ def _joints(model: mujoco.MjModel, joints: Iterable[int]) -> str:
     return f"[{', '.join(_toml(model.joint(k).name) for k in joints)}]"
 
 
+class _Corners(NamedTuple):
+    legs: dict[str, _Leg]  #: the leg of each corner
+    along_y: bool  #: whether the model looks along its y, as its abductions turn
+    backward: bool  #: whether it looks against that axis, as its joints' names say
+
+
+def _said_end(name: str) -> str | None:
+    """The end of the robot that a joint's name tells."""
+    words = [
+        end for end, words in ENDS.items() if re.search(f"(?<![a-z])({words})(?![a-z])", name, re.I)
+    ]
+    return words[0] if len(words) == 1 else None
+
+
 def _corners(
     model: mujoco.MjModel, data: mujoco.MjData, trunk: int, legs: list[_Leg], problems: list[str]
-) -> tuple[dict[str, _Leg], bool]:
-    """The leg of each corner, and whether the model looks along its y, as its abductions turn."""
+) -> _Corners:
     if not legs:
-        return {}, False
+        return _Corners({}, False, False)
     turn = data.xmat[trunk].reshape(3, 3).T
-    hips = [turn @ (data.xanchor[leg.joints[0]] - data.xpos[trunk]) for leg in legs]
+    hips = np.array([turn @ (data.xanchor[leg.joints[0]] - data.xpos[trunk]) for leg in legs])
     axes = [turn @ data.xaxis[leg.joints[0]] for leg in legs]
     forward = int(np.argmax(np.abs(axes).sum(axis=0)[:2]))
+    hips -= np.mean(hips, axis=0)
+    said = [_said_end(model.joint(leg.joints[0]).name) for leg in legs]
+    behind = ["hind" if hip[forward] > 0 else "front" for hip in hips]
+    backward = said == behind
+    if backward:
+        hips[:, :2] *= -1
     corners: dict[str, _Leg] = {}
-    for hip, leg in zip(hips - np.mean(hips, axis=0), legs, strict=True):
+    for hip, leg in zip(hips, legs, strict=True):
         ahead, left = hip[forward], hip[1] if forward == 0 else -hip[0]
         corner = ("F" if ahead > 0 else "R") + ("L" if left > 0 else "R")
         other = corners.setdefault(corner, leg)
@@ -288,7 +320,7 @@ def _corners(
             problems.append(
                 f"the legs of joints {both} both stand {CORNERS[corner]}; each corner has one"
             )
-    return corners, forward == 1
+    return _Corners(corners, forward == 1, backward)
 
 
 def _fixed(model: mujoco.MjModel, joint: int, places: dict[str, float]) -> str:
@@ -308,13 +340,14 @@ def _render(
     places: dict[str, float],
     problems: list[str],
 ) -> str:
-    corners, turned = _corners(model, data, trunk, legs, problems)
+    corners, along_y, backward = _corners(model, data, trunk, legs, problems)
     if not model.body(trunk).name:
         problems.append(f"the body of the free joint, the trunk, has no name; {GIVE}")
     lines = [f"model = {_toml(name)}", f"trunk = {_toml(model.body(trunk).name)}"]
-    if turned:
+    if along_y or backward:
+        axis = f"{'-' if backward else ''}{'y' if along_y else 'x'}"
         lines.append(
-            '# Looks along its y, it seems; if not, say end = "front" or "hind" of all legs.'
+            f'# Looks along its {axis}, it seems; if not, say end = "front" or "hind" of all legs.'
         )
     imus = [model.site(s).name for s in range(model.nsite) if model.site_bodyid[s] == trunk]
     lines += [f"imu = {_toml(imu)}" for imu in imus if "imu" in imu.lower()][:1]
@@ -333,6 +366,8 @@ def _render(
         leg = corners.get(corner)
         joints, foot = MISSING if leg is None else (_joints(model, leg.joints), leg.foot.text)
         lines += ["", f"[legs.{corner}]", f"joints = {joints}", f"foot = {foot}"]
+        if backward:
+            lines.append(f'end = "{"front" if corner[0] == "F" else "hind"}"')
         for k in leg.joints if leg else ():
             if not model.joint(k).name:
                 holder = quote(model.body(int(model.jnt_bodyid[k])).name)

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.files.validation import check_types
+from mjx_balance.robots.model import JOINT_ACTUATORS
 from mjx_balance.robots.robot import OUR_LEVER, OUR_MASS, Body, Leg, Robot
 from mjx_balance.robots.schema import LegFile, RobotError, RobotFile
 from mjx_balance.text import quote
@@ -16,7 +17,6 @@ LEVEL = math.cos(math.radians(1.0))  #: of the greatest angle of a joint's axis 
 SLACK = 1e-3  #: tolerance of an abduction's limits, rad
 FREE_KNEE = (0.1, 2.7)  #: bend of a knee without limits, rad: almost straight, on the thigh
 WHOLE_TURNS = [2 * math.pi * k for k in (0, 1, -1, 2, -2)]  #: between the model's angles and ours
-JOINT_ACTUATORS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 UNLIMITED = 1e4  #: torque limit of servos if neither file nor model gives one, N m
 
 # Numbers of our own robot (robots/quadruped.toml), from which others are scaled.
@@ -29,6 +29,10 @@ LEAST_STIFFNESS = 2.0
 """Least stiffness of the servos, relative to weight times leg; that of ours is 6.3. Below 1.2 a
 small robot tilts by half a degree on the tilted board."""
 SMALLEST = 0.01  #: least mass and size relative to ours
+DENSITY = (5.0, 20_000.0)
+"""Least and greatest mass over the product of the feet's span on both axes and the legs' length, kg
+/ m^3; the robots of 20 makers have 70 to 420."""
+STUCK = 0.1  #: range of all joints below which their limits are taken for another unit's, rad
 INCLINE = 7.0  #: board angle on both axes at once that the legs must compensate, deg (paper 3.1)
 
 Range = tuple[float, float]  #: least and greatest turn of a link (`Leg`), rad
@@ -50,6 +54,7 @@ def measure(
       RobotError: if the kinematics of a leg do not fit, or the legs are too short for the board.
     """
     either_way: list[str] = []
+    _check_limits(file, model)
     legs = _with_corners(
         [_leg(file, model, *one, either_way) for one in zip(file.legs, feet, strict=True)]
     )
@@ -74,6 +79,7 @@ def measure(
             f"middle; at least {SMALLEST * OUR_MASS:.2g} kg and {SMALLEST * OUR_LEVER:.2g} m are "
             "needed for a board of its size"
         )
+    _check_units(body, model)
     height = file.body_height or _standing_height(body)
     gain_scale = _gain_scale(body, height)
     robot = Robot(
@@ -147,6 +153,40 @@ def pose(
     return data
 
 
+def _check_limits(file: RobotFile, model: mujoco.MjModel) -> None:
+    """Refuses legs that can hardly move, as where degrees are taken for radians."""
+    joints = [model.joint(joint) for leg in file.legs for joint in leg.joints]
+    turns = [float(np.ptp(x.range)) for x in joints if model.jnt_limited[x.id]]
+    if len(turns) == len(joints) and max(turns) < STUCK:
+        raise RobotError(
+            f"the joints of its legs turn by {math.degrees(max(turns)):.2g} deg at most; an MJCF "
+            'file\'s limits are in deg, or in rad after <compiler angle="radian"/>'
+        )
+
+
+def _check_units(body: Body, model: mujoco.MjModel) -> None:
+    """Refuses sizes, masses and moments of inertia that no robot has; its model has other units."""
+    leg = float(np.mean(body.each("thigh") + body.each("calf")))
+    spans = [float(np.ptp(body.each(axis))) for axis in "xy"]
+    density = body.total_mass / max(math.prod(spans) * leg, 1e-12)
+    least, most = DENSITY
+    if not least < density < most:
+        odd = "light" if density <= least else "heavy"
+        raise RobotError(
+            f"it weighs {body.total_mass:.3g} kg, with legs of {leg:.3g} m whose feet span "
+            f"{spans[0]:.3g} x {spans[1]:.3g} m; no robot is as {odd} for its size: "
+            "write masses in kg and lengths in m"
+        )
+    greatest = body.total_mass * (leg + math.hypot(*spans)) ** 2
+    for link in map(model.body, range(1, model.nbody)):
+        if link.inertia.sum() / 2 > greatest:
+            raise RobotError(
+                f"body {quote(link.name)} of {link.mass[0]:.3g} kg has moments of inertia up to "
+                f"{link.inertia.max():.3g} kg m^2; the whole robot, of {body.total_mass:.3g} kg, "
+                f"could have {greatest:.3g}: write them in kg m^2"
+            )
+
+
 def _standing_height(robot: Body) -> float:
     """Body height with legs at `STRETCH`, within what a board at `INCLINE` needs, m."""
     room = math.tan(math.radians(INCLINE)) * (robot.half_length + robot.half_track)
@@ -160,7 +200,9 @@ def _standing_height(robot: Body) -> float:
         leg.drop - leg.axis_height + STRETCH * (leg.thigh + leg.calf) for leg in robot.legs
     ]
     stance = robot.foot_radius + float(np.mean(stretched))
-    return round(min(max(stance, low + room), high - room), 3)
+    height = min(max(stance, low + room), high - room)
+    rounded = round(height, 3)
+    return rounded if low + room <= rounded <= high - room else _clean(height)
 
 
 def _gain_scale(robot: Body, height: float) -> float:
@@ -301,10 +343,12 @@ def _bend(
         bend = backward or forward
     if bend is None:
         way = f" with the knee {leg.knee}" if leg.knee else ""
+        bounds = [abs(x) for x in (*hip, *knee) if math.isfinite(x)]
+        rad = "; their limits look like deg, and are read as rad" * (max(bounds) > 4 * math.pi)
         raise RobotError(
             f"joints {quote(leg.joints[1])} and {quote(leg.joints[2])} of leg {leg.name} cannot "
             f"turn far enough to keep its foot under the hip{way}: the thigh turns "
-            f"{_degrees(hip)}, the calf against it {_degrees(knee)}"
+            f"{_degrees(hip)}, the calf against it {_degrees(knee)}{rad}"
         )
     return bend
 

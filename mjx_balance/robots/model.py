@@ -20,6 +20,7 @@ from mjx_balance.robots.robot import MOST
 from mjx_balance.robots.schema import RobotError
 from mjx_balance.text import MESSAGE, quote, shorten
 
+JOINT_ACTUATORS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 FRESH = mujoco.MjSpec()  #: MuJoCo's own defaults, for elements that we add to a maker's model
 REMOVED = (
     *("sensors", "excludes", "pairs", "equalities", "tuples", "numerics", "texts", "tendons"),
@@ -327,6 +328,8 @@ def _clean(spec: mujoco.MjSpec) -> None:
     """Removes what the robot is not made of, before it costs memory or stops a compilation."""
     for geom in [x for x in spec.geoms if x.type == mujoco.mjtGeom.mjGEOM_HFIELD]:
         spec.delete(geom)
+    for actuator in [x for x in spec.actuators if x.trntype not in JOINT_ACTUATORS]:
+        spec.delete(actuator)  # of what is removed next
     for kind in REMOVED:
         for element in list(getattr(spec, kind)):
             spec.delete(element)
@@ -422,7 +425,7 @@ def _weigh_links(spec: mujoco.MjSpec) -> list[str]:
         if not any(x.mass for x in _rigid(body) if x.explicitinertial):
             raise RobotError(
                 f"link {quote(body.name)} moves, but neither it nor what is fixed to it has an "
-                "<inertial>; write its mass and moments of inertia"
+                "<inertial>; write its mass and moments of inertia, or leave it out by strip"
             )
     shaped = ", ".join(x.name for x in light if x.geoms)
     return [f"links without <inertial> weigh nothing: {shaped}"] if shaped else []
@@ -456,13 +459,17 @@ def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
         matrix = _inertia(body)
         if not np.isfinite([body.mass, *matrix.ravel()]).all():
             raise RobotError(f"body {quote(body.name)} has an inertia that is not finite")
+        if body.mass < 0:
+            raise RobotError(
+                f"body {quote(body.name)} has a mass of {body.mass:.3g} kg; it must not be negative"
+            )
         moments, axes = np.linalg.eigh(matrix)
         seconds = moments.sum() / 2 - moments
         slight = moments[0] > 0 and -seconds.min() <= SLIGHT * moments[-1]
         heavier = max(x.mass for x in _rigid(body) if x.explicitinertial) > body.mass
         possible = np.maximum(seconds, max(0.01 * seconds.max(), 1e-6 * body.mass, 1e-12))
         nearest = possible.sum() - possible
-        if body.mass < 0 or not (slight or heavier):
+        if not (slight or heavier):
             listed, near = (", ".join(f"{x:.3g}" for x in y) for y in (moments, nearest))
             remedy = (
                 f"the nearest are {near}" if seconds.max() > 0 else "a box has m (b^2 + c^2) / 12"

@@ -32,9 +32,12 @@ def read(path: Path, visual: bool) -> str:
     if any("xacro" in element.tag for element in robot.iter()):
         raise _xacro(path)
     _free_trunk(robot)
-    for shape in robot.iter("visual"):
-        for repeated in shape.findall("material")[1:]:
-            shape.remove(repeated)
+    for element in (*robot.iter("joint"), *robot.iter("visual")):
+        _drop_repeated(element)
+    for link in robot.iter("link"):
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            if not _has_size(shape):
+                link.remove(shape)
     extension = robot.find("mujoco")
     if extension is None:
         extension = ElementTree.SubElement(robot, "mujoco")
@@ -65,14 +68,32 @@ def _free_trunk(robot: ElementTree.Element) -> None:
                 robot.remove(link)
 
 
+def _drop_repeated(element: ElementTree.Element) -> None:
+    """Drops materials but the first, and what repeats an element before it."""
+    seen = set()
+    for child in list(element):
+        same = child.tag if child.tag == "material" else ElementTree.tostring(child).strip()
+        if same in seen:
+            element.remove(child)
+        seen.add(same)
+
+
+def _has_size(shape: ElementTree.Element) -> bool:
+    """Whether a shape is a mesh of a file, or a body whose sizes are not 0."""
+    names = ("filename", "radius", "length", "size")
+    sizes = [x.get(name, "") for x in shape.iterfind("geometry/*") for name in names]
+    return any(sizes) and all(x.strip("0.") for size in sizes for x in size.split())
+
+
 def _mesh_file(name: str, folders: tuple[Path, Path]) -> str:
     """The path of a mesh, or its name if there is no such file.
 
-    A package is a folder of its name above the URDF or in ROS_PACKAGE_PATH; or, under another name,
-    the folder of the URDF or the one above.
+    A package, or model of Gazebo, is a folder of its name above the URDF or in ROS_PACKAGE_PATH;
+    or, under another name, the folder of the URDF or the one above.
     """
-    package, _, inside = name.removeprefix("package://").partition("/")
-    if name.startswith("package://"):
+    scheme, _, rest = name.rpartition("://")
+    package, _, inside = rest.partition("/")
+    if scheme in ("package", "model"):
         above = (folders[1].absolute(), *folders[1].absolute().parents)
         roots = [x for x in above if x.name == package] + [x / package for x in above]
         roots += [Path(x) / package for x in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if x]

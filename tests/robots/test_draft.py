@@ -114,6 +114,32 @@ def test_the_heaviest_free_body_is_the_trunk(tmp_path: Path) -> None:
     assert '\ntrunk = "trunk"\n' in draft("model.xml", tmp_path / "model.xml")
 
 
+def test_what_lies_about_is_no_trunk(tmp_path: Path) -> None:
+    """Though it is heavier than the robot, and hinged."""
+    inertial = '<inertial pos="0 0 0" mass="300" diaginertia="1 1 1"/>'
+    lid = f'<body name="lid"><joint name="lid"/>{inertial}</body>'
+    crate = f'<body name="crate"><freejoint/>{inertial}{lid}</body>'
+    bodies.write_robot(tmp_path, [("<worldbody>", f"<worldbody>{crate}")])
+    assert '\ntrunk = "trunk"\n' in draft("model.xml", tmp_path / "model.xml")
+
+
+@pytest.mark.parametrize("turn", [0, 90])
+def test_one_that_looks_backward_as_its_names_say(turn: int, tmp_path: Path) -> None:
+    """Ours, with its hind legs named front: the corners are turned by half a turn."""
+    spec = bodies.turned(bodies.our_spec(), turn)
+    for old, new in (("LF", "back_right"), ("RF", "back_left"), ("LH", "front_right")):
+        spec.joint(f"{old}_abduction").name = f"{new}_hip_motor"
+    spec.joint("RH_abduction").name = "front_left_hip_motor"
+    for servo in [*spec.actuators]:
+        spec.delete(servo)
+    text, other = drafted(spec, tmp_path)
+    assert f"# Looks along its -{'y' if turn else 'x'}" in text
+    check_corners(other)
+    first = [leg.joints[0].removesuffix("_hip_motor") for leg in other.legs]
+    assert first == ["front_left", "front_right", "back_left", "back_right"]
+    assert [leg.knee[0] > 0 for leg in other.legs] == [True] * 4  # ours bend toward our hind
+
+
 def test_one_that_looks_along_y(tmp_path: Path) -> None:
     text, other = drafted(bodies.turned(bodies.our_spec(), 90), tmp_path)
     assert "# Looks along its y" in text
@@ -206,7 +232,14 @@ def without_servos() -> mujoco.MjSpec:
             lambda spec: spec.delete(spec.body("LF_hip")),
             "has 3 chains of three hinges .*RF_abduction",
         ),
-        (lambda spec: spec.delete(spec.joint("root")), "has no free joint"),
+        (
+            lambda spec: spec.delete(spec.joint("root")),
+            "has no free joint; .*: write <freejoint/> into its body 'trunk'",
+        ),
+        (
+            lambda spec: [spec.delete(spec.body(f"{leg}_hip")) for leg in ("LF", "RF")],
+            "has 2 chains .*; a robot of this kind has four legs of three",
+        ),
     ],
 )
 def test_what_cannot_be_drafted_is_refused(change: Any, message: str, tmp_path: Path) -> None:

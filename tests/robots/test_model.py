@@ -1,6 +1,7 @@
 """Makers' models as they really are: what is odd in them is mended and said, or refused."""
 
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -271,11 +272,13 @@ def test_a_mesh_that_cannot_be_read_stops_nothing(file: str, tmp_path: Path) -> 
     assert got.notes[0].endswith(f"no readable STL, OBJ or MSH files: {Path(file).name}")
 
 
+@pytest.mark.parametrize("scheme", ["package", "model"])
 @pytest.mark.parametrize("place", ["rex/meshes", "other/rex/meshes", "rex/urdf/meshes"])
-def test_a_package_of_meshes_is_a_folder(place: str, tmp_path: Path) -> None:
+def test_a_package_of_meshes_is_a_folder(place: str, scheme: str, tmp_path: Path) -> None:
     """Above the URDF, beside such a one, or the URDF's own under another name."""
     stl(tmp_path / place / "trunk.stl")
-    text = urdf([('<link name="trunk">', f'<link name="trunk">{mesh(UNREADABLE[0])}')])
+    file = UNREADABLE[0].replace("package", scheme)
+    text = urdf([('<link name="trunk">', f'<link name="trunk">{mesh(file)}')])
     folder = tmp_path / ("other/urdf" if place.startswith("other") else "rex/urdf")
     folder.mkdir(parents=True, exist_ok=True)
     got = drafted(folder, text, visual=True)
@@ -335,6 +338,8 @@ def test_a_texture_of_six_files_is_shown(tmp_path: Path) -> None:
         (("</robot>", "</link></robot>"), "cannot be read: mismatched tag"),
         (("<robot ", '\n<?xml version="1.0"?>\n<robot '), None),
         (("</robot>", "<!-- \u00e9 --></robot>"), None),
+        (('<axis xyz="1 0 0"/>', '<axis xyz="1 0 0"/>' * 2), None),
+        (('<axis xyz="1 0 0"/>', '<axis xyz="1 0 0"/><axis xyz="0 1 0"/>'), "element: 'axis'"),
     ],
 )
 def test_urdfs_as_they_are_written(
@@ -346,6 +351,113 @@ def test_urdfs_as_they_are_written(
     else:
         with pytest.raises(RobotError, match=message):
             drafted(tmp_path, text)
+
+
+SHAPELESS = {
+    "no geometry": "<visual/>",
+    "an empty geometry": "<visual><geometry/></visual>",
+    "a mesh without a file": "<visual><geometry><mesh/></geometry></visual>",
+    "a point": '<visual><geometry><sphere radius="0.0"/></geometry></visual>',
+    "a flat plate": '<collision><geometry><box size="1 1 0"/></geometry></collision>',
+}
+
+
+@pytest.mark.parametrize("kind", SHAPELESS)
+def test_shapes_without_a_size_are_left_out(kind: str, tmp_path: Path) -> None:
+    text = urdf([('<link name="trunk">', f'<link name="trunk">{SHAPELESS[kind]}')])
+    got = drafted(tmp_path, text, visual=True)
+    assert got.robot.total_mass == pytest.approx(TOTAL)
+    assert got.spec.compile().ngeom > 4  # feet and what shows the robot
+
+
+def scaled(text: str, names: str, factor: float) -> str:
+    """A URDF with the numbers of some attributes times a factor."""
+
+    def times(match: re.Match) -> str:
+        return f'{match[1]}="{" ".join(str(factor * float(x)) for x in match[2].split())}"'
+
+    return re.sub(rf'\b({names})="([^"]*)"', times, text)
+
+
+LENGTHS, MOMENTS = 'xyz(?=="[^"]*\\.)|size|radius', "i[xyz][xyz]"
+UNITS = {
+    "mm": (LENGTHS, 1000, "no robot is as light for its size: write masses in kg and lengths in m"),
+    "cm": (LENGTHS, 100, "no robot is as light"),
+    "inches": (LENGTHS, 39.37, "no robot is as light"),
+    "a tenth": (LENGTHS, 0.1, "no robot is as heavy"),
+    "g": (f"value|{MOMENTS}", 1000, "it weighs 1.52e.04 kg, .* no robot is as heavy"),
+    "g mm^2": (MOMENTS, 1e5, "body 'trunk' of 6.92 kg has moments .*; the whole .*: write them in"),
+    "limits in deg": ("lower|upper", 57.3, "look like deg, and are read as rad"),
+}
+
+
+@pytest.mark.parametrize("kind", UNITS)
+def test_numbers_of_another_unit(kind: str, tmp_path: Path) -> None:
+    names, factor, message = UNITS[kind]
+    with pytest.raises(RobotError, match=message) as caught:
+        drafted(tmp_path, scaled(urdf(), names, factor))
+    assert len(str(caught.value)) <= 300
+
+
+def test_limits_in_rad_that_are_read_as_deg(tmp_path: Path) -> None:
+    """The knee's 1.9 rad are 1.9 deg, and the hip's 4 are 4."""
+    with pytest.raises(RobotError, match=r'turn by 4 deg at most; .* <compiler angle="radian"/>'):
+        drafted(tmp_path, walker().replace('<compiler angle="radian"/>', ""))
+
+
+UNFREE = {
+    "a trunk on a planar joint": (
+        urdf([('name="stand" type="fixed"', 'name="stand" type="planar"')], "world"),
+        "leave out its joint 'stand', or make it floating",
+    ),
+    "legs on the world": (
+        bodies.edited(
+            walker(),
+            [('<body name="trunk"><freejoint/>', ""), ("</body></worldbody>", "</worldbody>")],
+        ),
+        "put its bodies, such as 'FL_hip', into one with a <freejoint/>",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", UNFREE)
+def test_how_to_free_a_trunk(kind: str, tmp_path: Path) -> None:
+    text, message = UNFREE[kind]
+    with pytest.raises(
+        RobotError, match=f"no free joint; its trunk must be free to move: {message}"
+    ):
+        draft_of(tmp_path, text)
+
+
+@pytest.mark.parametrize("knee", ["-2.7 -1.9", "-2 -1.1"])
+def test_a_small_robot_stands_as_its_limits_allow(knee: str, tmp_path: Path) -> None:
+    """A tenth of the walker with little room: a height in whole millimetres would leave none."""
+    text = walker().replace("-2.7 -.8", knee)
+    length = re.compile(r'(pos|size)="([^"]*)"')
+    small = length.sub(
+        lambda x: f'{x[1]}="{" ".join(str(0.1 * float(y)) for y in x[2].split())}"', text
+    )
+    small = re.sub('mass="([^"]*)"', lambda x: f'mass="{float(x[1]) / 20}"', small)
+    robot = drafted(tmp_path, small).robot
+    low, high = robot.height_range
+    room = np.tan(np.radians(7)) * (robot.half_length + robot.half_track)
+    assert low + room - 1e-9 <= robot.body_height <= high - room + 1e-9
+
+
+def test_a_mass_below_zero(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"'LF_thigh' has a mass of -1\.15 kg; it must not be neg"):
+        drafted(tmp_path, urdf([('value="1.15"', 'value="-1.15"')]))
+
+
+@pytest.mark.parametrize("kind", ["actuator of a tendon", "motor of a joint"])
+def test_actuators_of_what_is_left_out(kind: str, tmp_path: Path) -> None:
+    """Their targets are gone, and they go too."""
+    tendon = '<tendon><fixed name="t"><joint joint="lift" coef="1"/></fixed></tendon>'
+    motor = 'tendon="t"' if kind == "actuator of a tendon" else 'joint="lift"'
+    more = f'{tendon}<actuator><motor {motor}/><motor joint="lift"/></actuator></mujoco>'
+    text, problems = sketch_of(tmp_path, walker(more=ARM).replace("</mujoco>", more), ["lift"])
+    assert problems == []
+    assert built(tmp_path, text).robot.total_mass == pytest.approx(9)
 
 
 MENDED = {
