@@ -176,7 +176,7 @@ class Controller:
         self._commands[:] = self._height
         self._path = self._legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]
-        self._since = self._seen = 0
+        self._since = self._seen = self._gaps = 0
         self._called = self._decided = math.nan
 
     def hold(self, reason: str) -> None:
@@ -292,6 +292,7 @@ class Controller:
         recent = self._imu[-self._recent :]
         different = len(set(recent.view(f"V{recent.itemsize * IMU}")[:, 0].tolist()))
         self._check_new("IMU", different, len(recent), LIVELY)
+        self._check_latest((recent[1:] != recent[:-1]).any(axis=1))
         joints, targets = self._reading[:-IMU], self._targets.ravel()
         if np.abs(joints - self._poses[0]).max() > MOVED_LEAST:
             since = self._imu[-max(self._recent, self.decision_samples) :]
@@ -306,6 +307,18 @@ class Controller:
             raise _Unsafe(
                 f"{self._name(k)} reads {joints[k]:.3g} all the time, while its target moved by "
                 f"{moved[k]:.2g} rad"
+            )
+
+    def _check_latest(self, new: np.ndarray) -> None:
+        """Checks that the newest samples, of which the policy knows most, are no gap in bursts."""
+        count = len(new) // 3
+        latest, least = int(new[-count:].sum()), int(count * LIVELY)
+        gap = latest < least and self.decision_samples >= self._recent
+        self._gaps = self._gaps + 1 if gap else 0
+        if self._gaps == 2:
+            raise _Unsafe(
+                f"the IMU repeats itself: at two decisions, one after the other, {latest} of its "
+                f"last {count} samples are new; at least {least} must be"
             )
 
     def _check_new(self, name: str, new: int, count: int, share: float) -> None:

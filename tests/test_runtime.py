@@ -434,13 +434,28 @@ def test_old_samples_make_it_hold_at_a_decision(
     assert re.match(reason, rig.controller.reason)
 
 
+@pytest.mark.parametrize(("gap", "latest", "holds"), [(20, 0, True), (12, 4, True), (11, 5, False)])
+def test_a_gap_before_every_decision_makes_it_hold(
+    rig: Rig, gap: int, latest: int, holds: bool
+) -> None:
+    """Three fifths of the samples are new; with such a gap of 20 the robot leans by 5 deg."""
+    rig.steps(101)
+    fed(rig, 50, lambda k: imu(min(k, 49 - gap)))
+    assert rig.controller.state is State.BALANCING
+    fed(rig, 50, lambda k: imu(50 + min(k, 49 - gap)))
+    assert (rig.controller.state is State.HOLDING) == holds
+    wanted = f"at two decisions, one after the other, {latest} of its last 16 samples are new; at"
+    assert (wanted in rig.controller.reason) == holds
+
+
 LIVELY: dict[str, Callable[[int], dict[str, Any]]] = {
     "125 Hz": lambda k: imu(k // 2),
     "100 Hz": lambda k: imu(2 * k // 5),
     "every tenth sample repeated": lambda k: imu(k - (k % 10 == 9)),
-    "nothing new for 80 ms now and then": lambda k: imu(k - max(0, k % 50 - 29)),
+    "nothing new for 80 ms now and then": lambda k: imu(k - max(0, k % 100 - 79)),
     "a quiet gyro of few values": lambda k: {"gyro": np.array([0.05, 0.001 * (k * k % 7 % 3), 0])},
     "an accelerometer of 83 Hz": lambda k: one("accel", k // 3),
+    "bursts that end with a decision": lambda k: imu(k // 50 * 50 + max(k % 50, 25)),
 }
 
 
