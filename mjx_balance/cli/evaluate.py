@@ -9,7 +9,7 @@ from rich.console import Console
 from mjx_balance.cli.common import ControllerArgs, check_out, complain
 from mjx_balance.errors import FAILED
 from mjx_balance.evaluation.controllers import Controller
-from mjx_balance.evaluation.rollout import run_suite, summarize
+from mjx_balance.evaluation.rollout import run_suite, suite_scene, summarize
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.report.progress import Display
 from mjx_balance.report.tables import evaluation_table, print_table
@@ -23,7 +23,7 @@ class EvaluateArgs(ControllerArgs):
 
     suite: str = "paper"
     """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast,
-    steep, steps or sea."""
+    steep, steps, sea or platform."""
     scenarios: int = 256
     """Number of scenarios."""
     duration: float = 60.0
@@ -59,7 +59,7 @@ def _video(scene: Scene, controller: Controller, args: EvaluateArgs) -> int:
     rollout = run_suite(scene, controller, args.suite, 1, args.duration, args.seed, record=True)
     assert rollout.qpos is not None
     try:
-        render.write(args.video, scene, rollout.qpos[0])
+        render.write(args.video, suite_scene(scene, args.suite), rollout.qpos[0])
     except render.RenderError as error:
         return complain(f"no video written: {error}", FAILED)
     print(f"video of the first scenario: {shorten(args.video, PATH)}")

@@ -11,7 +11,7 @@ import tyro
 from mjx_balance.cli.common import ControllerArgs, complain
 from mjx_balance.envs.batch import BatchEnv, Episodes
 from mjx_balance.evaluation.controllers import Controller
-from mjx_balance.evaluation.rollout import look
+from mjx_balance.evaluation.rollout import look, suite_scene
 from mjx_balance.evaluation.suites import check_seed, draw_suite
 from mjx_balance.robots.limits import greatest_incline
 from mjx_balance.sim.scene import Scene
@@ -45,7 +45,7 @@ def view(argv: list[str]) -> int:
     scene, controller = args.load()
     session = Session(scene, controller, args.suite, args.seed)
     try:
-        window = render.Window(scene, session.press)
+        window = render.Window(session.scene, session.press)
     except render.RenderError as error:
         return complain(f"{error}; `mjx-balance evaluate --video` needs no display")
     above, below = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
@@ -71,7 +71,8 @@ class Session:
           SuiteError: if the suite does not exist, or the seed is negative.
         """
         check_seed(seed)
-        self.scene, self.task, self.controller = scene, scene.task, controller
+        self.scene = scene = scene if suite is None else suite_scene(scene, suite)
+        self.task, self.controller = scene.task, controller
         self.suite, self.seed = suite, seed
         self.max_incline = greatest_incline(self.task, scene.robot)
         self.rng = np.random.default_rng(seed)

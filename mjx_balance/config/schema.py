@@ -69,6 +69,12 @@ class TaskConfig:
     max_incline and board_rate allow."""
     sea_period: Positive = 10.0
     """Peak period of the sea, s (chosen: a moderate sea)."""
+    platform: bool = False
+    """Whether the board stands on a platform that surges, sways and heaves with the sea; without
+    one, the scene has no joints for it."""
+    sea_height: NonNegative = 1.0
+    """Significant height of the platform's heave, crest to trough, m; along the heading it surges
+    and sways by the same (chosen: a slight sea)."""
     sea_heading: Annotated[float, Ge(-360), Le(360)] | None = None
     """Mean direction in which the waves run, deg from straight ahead to the left; none: any."""
     fail_tilt: Annotated[float, Gt(0), Lt(90)] = 6.0

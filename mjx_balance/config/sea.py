@@ -20,6 +20,7 @@ WAVES = 8
 """Waves of a sea, of equal energy. The sum of so many amplitudes, sqrt(2 * WAVES) / 4 of the
 significant height, is the height itself."""
 HIGHEST = 2.0  #: greatest frequency, in peak frequencies
+GRAVITY = 9.81  #: m/s^2
 TOP = math.exp(-1.25 / HIGHEST**4)  #: share of the spectrum's energy below it
 
 
@@ -41,18 +42,21 @@ def fade(time: Any, period: float) -> Any:
     return part * part * (3.0 - 2.0 * part)
 
 
-def _greatest_rate() -> float:
-    """Greatest rate of a sea whose amplitudes add up to 1, over the time in peak periods.
+def _bounds() -> tuple[float, float]:
+    """Greatest rate and acceleration of a sea whose amplitudes add up to 1, in peak periods.
 
-    Each wave adds at most the size of its derivative, of `fade` times a sine, in the fastest case.
+    The derivatives of `fade` times a sine of each wave, in the fastest case, at the worst time.
     """
     time = np.linspace(0.0, 1.0, 1001)
     omega = 2 * np.pi * frequency(np.arange(1, WAVES + 1)[:, None] / WAVES)
-    return float(np.hypot(omega * fade(time, 1.0), 6 * time * (1 - time)).mean(axis=0).max())
+    size, slope, bend = fade(time, 1.0), 6 * time * (1 - time), 6 - 12 * time
+    rate = np.hypot(omega * size, slope)
+    acceleration = np.hypot(bend - omega**2 * size, 2 * omega * slope)
+    return float(rate.mean(axis=0).max()), float(acceleration.mean(axis=0).max())
 
 
-RATE = _greatest_rate()
-"""Bound of a sea's speed: of significant height 1 and peak period 1 s."""
+RATE, ACCELERATION = _bounds()
+"""Bounds of a sea's speed and acceleration: of significant height 1 and peak period 1 s."""
 
 
 def significant_angle(task: TaskConfig) -> float:
@@ -76,3 +80,13 @@ def significant_angle(task: TaskConfig) -> float:
             "longer period"
         )
     return task.sea_angle
+
+
+def check_platform(task: TaskConfig) -> None:
+    """Raises `ConfigError` if the platform may fall away faster than the robot."""
+    highest = GRAVITY * task.sea_period**2 / ACCELERATION
+    if task.sea_height > highest:
+        raise ConfigError(
+            f"sea_height is {task.sea_height} m; with sea_period {task.sea_period} s the platform "
+            f"would fall faster than the robot: at most {highest:.3g} m, or a longer period"
+        )

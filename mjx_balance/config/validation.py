@@ -2,7 +2,7 @@
 
 from mjx_balance.config.presets import preset
 from mjx_balance.config.schema import Config, ConfigError, RandomizationConfig, TaskConfig
-from mjx_balance.config.sea import significant_angle
+from mjx_balance.config.sea import check_platform, significant_angle
 from mjx_balance.config.sweep import sweep_grid, with_values
 from mjx_balance.files.validation import check_types
 from mjx_balance.text import quote
@@ -83,6 +83,13 @@ def _check_motions(task: TaskConfig) -> None:
             f"{task.target_period} s, it must be at least {slowest:.3g}"
         )
     significant_angle(task)
+    if task.platform and "sea" not in task.board_motions:
+        raise ConfigError(
+            f"platform is True, but board_motions is {task.board_motions}; a platform moves with "
+            "the sea alone: name sea there"
+        )
+    if task.platform:
+        check_platform(task)
 
 
 def _check_inputs(task: TaskConfig) -> None:

@@ -26,6 +26,7 @@ SWEEPS = 25  #: rounds of coordinate descent of the predictive controllers
 class View(NamedTuple):
     """What n scenarios of an evaluation show before a decision; a policy looks at `obs` alone."""
 
+    scene: Scene  # in which the addresses in qpos and qvel hold
     ids: np.ndarray  # (n,) numbers of these scenarios in the batch, for controllers with a memory
     env_steps: int  # decisions since the start
     obs: np.ndarray  # (n, obs_size) the network's input
@@ -65,9 +66,9 @@ def measure_response(scene: Scene) -> Response:
     return Response(end / change.diagonal(), course / end[:, None])
 
 
-def attitude(scene: Scene, view: View) -> np.ndarray:
+def attitude(view: View) -> np.ndarray:
     """(n, 2) true roll and pitch of the body, deg."""
-    return np.stack(roll_pitch(view.qpos[:, scene.trunk_quat]), axis=-1)
+    return np.stack(roll_pitch(view.qpos[:, view.scene.trunk_quat]), axis=-1)
 
 
 def stand(scene: Scene) -> Controller:
@@ -86,7 +87,7 @@ class AttitudePD:
           proportional: share of the tilt undone by one decision (benchmarks/limits.py).
           rate: time for which the present rate is undone beforehand, s (same).
         """
-        self.scene, self.task = scene, scene.task
+        self.task = scene.task
         self.proportional, self.rate = proportional, rate
         self.gain = measure_response(scene).gain
 
@@ -98,8 +99,8 @@ class AttitudePD:
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Roll and pitch (n, 2), deg, and their rates (n, 2), deg/s."""
-        turn = self.scene.trunk_velocity + 3
-        return attitude(self.scene, view), np.degrees(view.qvel[:, turn])
+        turn = view.scene.trunk_velocity + 3
+        return attitude(view), np.degrees(view.qvel[:, turn])
 
 
 class ImuPD(AttitudePD):
@@ -156,7 +157,7 @@ class Predictive:
           forecast: (task, scenario, now (n,), ahead (m,)) -> (n, m, 2) change of the
             board's angles, deg.
         """
-        self.scene, self.task, self.forecast = scene, scene.task, forecast
+        self.task, self.forecast = scene.task, forecast
         response, steps = measure_response(scene), self.task.sim_steps
         self.gain = response.gain
         # effect[axis, j, t]: deg at step t per deg of action j
@@ -179,11 +180,11 @@ class Predictive:
         ahead = task.sim_dt * np.arange(1, HORIZON * task.sim_steps + 1)
         now = np.full(n, view.env_steps * task.ctrl_dt)
         x, y = np.moveaxis(self.forecast(task, view.scenario, now, ahead), -1, 0)
-        w, i, j, k = view.qpos[:, self.scene.trunk_quat].T
+        w, i, j, k = view.qpos[:, view.scene.trunk_quat].T
         yaw = np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))[:, None]
         cos, sin = np.cos(yaw), np.sin(yaw)
         board = np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)  # in the body's frame
-        free = attitude(self.scene, view)[:, None] + board
+        free = attitude(view)[:, None] + board
         free = free + np.where(delayed, older, newer)[:, None] * self.unfinished.T
         linear = np.einsum("xjt,ntx->nxj", self.effect, free)
         limit = np.abs(self.gain) * task.action_max

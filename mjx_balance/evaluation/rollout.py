@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_balance.config import TaskConfig
+from mjx_balance.config import Config, TaskConfig
 from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.errors import InputError
 from mjx_balance.evaluation.controllers import Controller, View
@@ -61,6 +61,7 @@ def look(env: BatchEnv, ids: np.ndarray, number: int, obs: np.ndarray, imu: np.n
     """What envs `ids` show before decision `number`; obs and imu are of their last outcome."""
     delay = np.zeros(len(ids)) if env.state.params is None else env.state.params.delay[ids]
     return View(
+        scene=env.scene,
         ids=ids,
         env_steps=number,
         obs=obs,
@@ -213,6 +214,15 @@ def policy_scene(policy: Policy, robot: str | None = None) -> Scene:
     return scene
 
 
+def suite_scene(scene: Scene, suite: str) -> Scene:
+    """The scene in which a suite runs: this one, with a platform if the suite moves one."""
+    chosen = SUITES.get(suite)
+    if scene.task.platform or chosen is None or not chosen.platform:
+        return scene
+    task = dataclasses.replace(scene.task, platform=True)
+    return load_scene(Config(robot=scene.robot_source, task=task))
+
+
 def evaluate(
     policy: Policy,
     suite: str,
@@ -268,12 +278,13 @@ def run_suite(
     progress: Progress = lambda share: None,
     record: bool = False,
 ) -> Rollout:
-    """Rolls a controller out on a suite's scenarios.
+    """Rolls a controller out on a suite's scenarios, in `suite_scene`.
 
     Raises:
       EvaluationError: if there are no scenarios or no time, or too much for the memory.
       SuiteError: as `draw_suite`.
     """
+    scene = suite_scene(scene, suite)
     check_fits(scene.task, scenarios, duration, scene.model.nq if record else 0)
     episodes = draw_suite(scene.task, scene.robot, suite, scenarios, duration, seed)
     return roll_out(scene, controller, episodes, duration, record, progress)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mjx_balance.config import RandomizationConfig, TaskConfig
+from mjx_balance.config.sea import check_platform
 from mjx_balance.envs.batch import Episodes, stacked
 from mjx_balance.errors import InputError
 from mjx_balance.robots.catalogue import Robot
@@ -37,6 +38,7 @@ class Suite:
     targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
     """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg, of ramps."""
     motion: str | None = None  #: kind of board motion (`tilt.MOTIONS`) instead of ramps
+    platform: bool = False  #: whether the platform of `TaskConfig.platform` moves
     fast: bool = False  #: board speeds uniform from the config's to the authority limit
     steep: bool = False  #: inclines uniform from the config's to the reach of the legs
 
@@ -54,6 +56,7 @@ SUITES: dict[str, Suite] = {
     "steep": Suite(steep=True),
     "steps": Suite(motion="steps"),  # jumps of up to two thirds of the fall limit
     "sea": Suite(motion="sea"),  # waves in all directions
+    "platform": Suite(motion="sea", platform=True),  # which surges, sways and heaves as well
 }
 """By the names of `mjx-balance evaluate --suite`."""
 HEADLINE = ("paper", "corner")  #: evaluated after training, in reports and tables
@@ -90,13 +93,18 @@ def draw_suite(
 
     Raises:
       ConfigError: if the sea of the config is out of bounds.
-      SuiteError: for an unknown suite, a negative seed, or a board that does not arrive
-        before its next target.
+      SuiteError: for an unknown suite, a negative seed, a suite that needs another scene
+        (`rollout.suite_scene`), or a board that does not arrive before its next target.
     """
     if suite not in SUITES:
         raise SuiteError(f"unknown suite {suite!r}; known suites: {', '.join(SUITES)}")
     check_seed(seed)
     chosen = SUITES[suite]
+    if chosen.platform and not task.platform:
+        raise SuiteError(
+            f"suite {suite!r} moves a platform, which the scene does not have; it needs platform "
+            "True in its config (evaluation.rollout.suite_scene)"
+        )
     count = tilt.num_targets(task, duration)
     rngs = [np.random.default_rng((seed, k)) for k in range(scenarios)]
     uniform = np.asarray([rng.uniform(size=(count, 2)) for rng in rngs])
@@ -117,8 +125,10 @@ def draw_suite(
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     if chosen.motion is not None:
         draw = tilt.MOTIONS[chosen.motion].draw
+        still = task if chosen.platform else dataclasses.replace(task, sea_height=0.0)
+        check_platform(still)
         own = [np.random.default_rng((seed, k, 3)) for k in range(scenarios)]
-        scenario = stacked([draw(task, count, tilt.numpy_uniform(rng)) for rng in own])
+        scenario = stacked([draw(still, count, tilt.numpy_uniform(rng)) for rng in own])
     return Episodes(
         scenario=scenario,
         params=draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None,

@@ -17,7 +17,8 @@ from mjx_balance.task import Array
 from mjx_balance.task.kinematics import joint_angles
 from mjx_balance.task.step import Targets
 
-ROBOT, BOARD = "robot/", "board/"
+ROBOT, BOARD, PLATFORM = "robot/", "board/", "platform/"
+SLIDES = ("surge", "sway", "heave")
 CONTACT_TIME = 0.01  #: of the foot contacts, s: near the shortest that 4 ms steps carry
 SETTLE_STEPS = 750
 SETTLE_ROUNDS = 4
@@ -49,6 +50,8 @@ class Layout:
     leg_ctrl: Int[np.ndarray, "legs 3"]  #: of the leg servos in ctrl
     board_qpos: Int[np.ndarray, "2"]  #: of the board hinges, X and Y, in qpos
     board_ctrl: Int[np.ndarray, "2"]  #: of the board servos in ctrl
+    platform_qpos: Int[np.ndarray, " slides"]  #: of surge, sway and heave in qpos, if there are any
+    platform_ctrl: Int[np.ndarray, " slides"]  #: of their servos in ctrl
     trunk_quat: Int[np.ndarray, "4"]  #: of the trunk's orientation in qpos
     trunk_velocity: Int[np.ndarray, "2"]  #: of its velocity along the world's x, y in qvel
     imu: Int[np.ndarray, "6"]  #: of gyro and accelerometer in sensordata
@@ -61,11 +64,12 @@ class Scene(Layout):
     stance: Stance
 
     def ctrl(self, targets: Targets) -> Float[Array, "*batch sim_steps nu"]:
-        """Servo targets in the model's order, rad."""
+        """Servo targets in the model's order, rad, and m of a platform."""
         joints = targets.joints + self.stance.leg_trim.astype(targets.joints.dtype)
         xp = joints.__array_namespace__()
         flat = (targets.board, joints.reshape(*joints.shape[:-2], -1))
-        order = np.argsort(np.concatenate((self.board_ctrl, self.leg_ctrl.ravel())))
+        servos = (self.board_ctrl, self.platform_ctrl, self.leg_ctrl.ravel())
+        order = np.argsort(np.concatenate(servos))
         return xp.concatenate(flat, axis=-1)[..., order]
 
     @property
@@ -92,7 +96,8 @@ def build_model(task: TaskConfig, robot_source: str, visual: bool = False) -> mu
     body = robot_spec(robot_source, visual)
     size = body.numeric(BOARD_SIZE)
     board = _board(robot, None if size is None else float(size.data[0]))
-    stage.attach(board, prefix=BOARD, frame=stage.worldbody.add_frame())
+    carrier = _platform(stage, robot) if task.platform else stage.worldbody
+    stage.attach(board, prefix=BOARD, frame=carrier.add_frame())
     for name in (x for x in dir(stage.option) if not x.startswith("_")):
         setattr(body.option, name, getattr(stage.option, name))
     frame = stage.worldbody.add_frame(pos=[0, 0, task.body_height])
@@ -112,6 +117,21 @@ def build_model(task: TaskConfig, robot_source: str, visual: bool = False) -> mu
         for geom in [g for g in stage.geoms if g.group == VISUAL_GROUP]:
             stage.delete(geom)
     return stage.compile()
+
+
+def _platform(stage: mujoco.MjSpec, robot: Robot) -> mujoco.MjsBody:
+    """Adds the platform, as heavy and stiff for this robot as ours is for our own."""
+    platform = mujoco.MjSpec.from_file(str(scene_dir() / "platform.xml"))
+    for joint in platform.joints:
+        joint.armature *= robot.mass_scale
+        joint.damping = joint.damping * robot.mass_scale
+    for servo in platform.actuators:
+        servo.set_to_position(kp=servo.gainprm[0] * robot.mass_scale)
+    stage.attach(platform, prefix=PLATFORM, frame=stage.worldbody.add_frame())
+    for camera in stage.cameras:  # follows the board
+        camera.mode = mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY
+        camera.targetbody = f"{PLATFORM}platform"
+    return stage.body(f"{PLATFORM}platform")
 
 
 def _board(robot: Robot, size: float | None) -> mujoco.MjSpec:
@@ -154,6 +174,7 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     model = build_model(config.task, config.robot, visual)
     names = [[f"{ROBOT}{joint}" for joint in leg.joints] for leg in robot.legs]
     board = [f"{BOARD}board_{axis}" for axis in "xy"]
+    slides = [f"{PLATFORM}{name}" for name in SLIDES] if config.task.platform else []
     trunk = model.body(f"{ROBOT}{robot.trunk}")
     root = model.joint(int(trunk.jntadr[0]))
     sensors = [model.sensor(f"{ROBOT}{name}") for name in (GYRO, ACCELEROMETER)]
@@ -168,6 +189,8 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
         leg_ctrl=ids([[model.actuator(n).id for n in leg] for leg in names]),
         board_qpos=ids([model.joint(n).qposadr[0] for n in board]),
         board_ctrl=ids([model.actuator(n).id for n in board]),
+        platform_qpos=ids([model.joint(n).qposadr[0] for n in slides]),
+        platform_ctrl=ids([model.actuator(n).id for n in slides]),
         trunk_quat=ids(root.qposadr[0] + np.arange(3, 7)),
         trunk_velocity=ids(root.dofadr[0] + np.arange(2)),
         imu=ids([k for s in sensors for k in range(s.adr[0], s.adr[0] + s.dim[0])]),

@@ -37,7 +37,8 @@ class Memory(NamedTuple):
 class Targets(NamedTuple):
     """Servo targets at every physics step of a decision."""
 
-    board: Float[Array, "*batch sim_steps 2"]  #: board angles about X and Y, rad
+    board: Float[Array, "*batch sim_steps axes"]
+    """Board angles about X and Y, rad; with a platform, also surge, sway and heave, m."""
     joints: Float[Array, "*batch sim_steps legs 3"]  #: abduction, hip and knee angles, rad
 
 
@@ -143,6 +144,9 @@ def pre_step(
     sim_step = np.arange(1, task.sim_steps + 1).astype(heights.dtype)
     time = task.ctrl_dt * state.env_steps[..., None] + task.sim_dt * sim_step
     board = tilt.board_angle(task, state.scenario, time) * (np.pi / 180)
+    if task.platform:
+        position = tilt.platform_position(task, state.scenario, time)
+        board = xp.concatenate((board, position), axis=-1)
     path = kinematics.ramp(task, memory.heights, heights)
     moving = kinematics.joint_angles(robot, path[..., : task.ramp_steps, :])
     resting = xp.repeat(moving[..., -1:, :, :], task.sim_steps - task.ramp_steps, axis=-3)

@@ -1,4 +1,4 @@
-"""Board tilt: a scenario is a value, and the board's angle a closed form of it.
+"""Board motion: a scenario is a value, and the board's angle a closed form of it.
 
 The angle is the sum of a motion from target to target and of waves. `MOTIONS` is the table of the
 kinds of motion.
@@ -22,11 +22,14 @@ MOST_CALLS = 16  #: greatest number of calls of `uniform` that a scenario takes
 
 
 class Waves(NamedTuple):
-    """Sines that are added to the board's angle, from the first peak period on in full."""
+    """Sines that move the board, from the first peak period on in full.
 
-    amplitude: Float[Array, "*batch waves 2"]  #: about X and Y, deg
+    There are two axes, X and Y, or five: a platform also surges, sways and heaves.
+    """
+
+    amplitude: Float[Array, "*batch waves axes"]  #: deg about X and Y; m along x, y and z
     omega: Float[Array, "*batch waves"]  #: frequency, rad/s
-    phase: Float[Array, "*batch waves 2"]  #: at time 0, rad
+    phase: Float[Array, "*batch waves axes"]  #: at time 0, rad
 
 
 class Scenario(NamedTuple):
@@ -62,17 +65,28 @@ def board_angle(
     Waves are added.
     """
     angle = _toward_targets(task, scenario, time)
-    return angle if scenario.waves is None else angle + _at_sea(task, scenario.waves, time)
+    if scenario.waves is None:
+        return angle
+    return angle + _at_sea(task, scenario.waves, time, slice(0, 2))
+
+
+def platform_position(
+    task: TaskConfig, scenario: Scenario, time: Float[Array, "*batch times"]
+) -> Float[Array, "*batch times 3"]:
+    """Surge, sway and heave of the platform, m, at times since the start, s."""
+    if scenario.waves is None:
+        return (0 * time)[..., None] + 0 * scenario.targets[..., :1, :1] + np.zeros(3, time.dtype)
+    return _at_sea(task, scenario.waves, time, slice(2, 5))
 
 
 def _at_sea(
-    task: TaskConfig, waves: Waves, time: Float[Array, "*batch times"]
-) -> Float[Array, "*batch times 2"]:
-    """Sum of the waves, deg."""
+    task: TaskConfig, waves: Waves, time: Float[Array, "*batch times"], axes: slice
+) -> Float[Array, "*batch times axes"]:
+    """Sum of the waves on some axes, in their units."""
     xp = time.__array_namespace__()
     turn = (time[..., None] * waves.omega[..., None, :])[..., None]
-    sines = xp.sin(turn + waves.phase[..., None, :, :])
-    total = (waves.amplitude[..., None, :, :] * sines).sum(axis=-2)
+    sines = xp.sin(turn + waves.phase[..., None, :, axes])
+    total = (waves.amplitude[..., None, :, axes] * sines).sum(axis=-2)
     return fade(time, task.sea_period)[..., None] * total
 
 
@@ -128,9 +142,8 @@ def draw_scenario(task: TaskConfig, uniform: Uniform) -> Scenario:
         return drawn[0]
     number = uniform((), 0.0, float(len(drawn)))
     xp = number.__array_namespace__()
-    calm = Waves(
-        *(xp.zeros(shape, dtype=number.dtype) for shape in ((WAVES, 2), WAVES, (WAVES, 2)))
-    )
+    axes = (WAVES, 5 if task.platform else 2)
+    calm = Waves(*(xp.zeros(shape, dtype=number.dtype) for shape in (axes, WAVES, axes)))
     kinds = [(*x[:3], *(calm if x.waves is None else x.waves)) for x in drawn]
     chosen: list[Array] = list(kinds[0])
     for k, kind in enumerate(kinds[1:], start=1):
@@ -176,10 +189,15 @@ def _draw_sea(task: TaskConfig, count: int, uniform: Uniform) -> Scenario:
     spread = xp.arcsin(xp.sqrt(radius) * xp.cos(2 * np.pi * turn))
     # From (k, k + 1]: the logarithm of 0 is none of a frequency's.
     omega = (2 * np.pi / task.sea_period) * frequency((np.arange(1, WAVES + 1) - share) / WAVES)
-    unit = _wave_axes(heading + spread)
-    amplitude = significant_angle(task) / 4 * math.sqrt(2 / WAVES)
-    start = 2 * np.pi * phase[:, None]
-    waves = Waves(amplitude * unit, omega, start + xp.zeros_like(unit))
+    # Of a significant height of 1.
+    unit = math.sqrt(2 / WAVES) / 4
+    amplitude = unit * significant_angle(task) * _wave_axes(heading + spread)
+    start = 2 * np.pi * phase[:, None] + xp.zeros_like(amplitude)
+    if task.platform:
+        orbit = unit * task.sea_height * _orbit(heading + spread)
+        amplitude = xp.concatenate((amplitude, orbit), axis=-1)
+        start = xp.concatenate((start, start, start[:, :1] + np.pi / 2), axis=-1)
+    waves = Waves(amplitude, omega, start)
     still = xp.zeros_like(heading)
     return Scenario(xp.zeros((count, 2), dtype=share.dtype), still, still + task.board_rate, waves)
 
@@ -191,6 +209,16 @@ def _wave_axes(heading: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
     """
     xp = heading.__array_namespace__()
     return xp.stack((xp.sin(heading), -xp.cos(heading)), axis=-1)
+
+
+def _orbit(heading: Float[Array, "*batch"]) -> Float[Array, "*batch 3"]:
+    """Surge, sway and heave of waves per unit of height, of directions, rad.
+
+    In deep water a particle of the surface moves in a circle: along the heading in phase with the
+    slope there, and up a quarter of a period earlier (Airy's theory).
+    """
+    xp = heading.__array_namespace__()
+    return xp.stack((xp.cos(heading), xp.sin(heading), xp.ones_like(heading)), axis=-1)
 
 
 class BoardMotion(NamedTuple):

@@ -118,7 +118,7 @@ def test_who_falls_is_put_back_up_on_a_level_board(scene: Scene) -> None:
     np.testing.assert_allclose(one.step()[0], scene.stance.qpos, atol=1e-3)
 
 
-@pytest.mark.parametrize("suite", ["push", "payload", "noise", "latency"])
+@pytest.mark.parametrize("suite", ["push", "payload", "noise", "latency", "platform"])
 def test_a_suite_is_shown_as_it_is_evaluated(scene: Scene, suite: str) -> None:
     """The same states as `evaluate --suite ... --seed 3`: pushes, loads, noise and delays."""
     controller: Controller = make_controller("pd-imu", scene)

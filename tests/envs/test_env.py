@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mjx_balance.config import Config
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.task.observation import observation_names
+from mjx_balance.task.tilt import platform_position
 
 RESETS = 4_000
 ENVS, EPISODE, STAND = 32, 50, 220
@@ -252,6 +253,24 @@ def test_seas_and_jumps_are_drawn_beside_ramps(config: Config) -> None:
     np.testing.assert_allclose(
         (drawn.waves.amplitude[sailing] ** 2).sum(axis=(1, 2)).std(), 0, atol=1e-5
     )
+
+
+def test_a_platform_moves_inside_a_program(config: Config) -> None:
+    """In MuJoCo's C engine, behind XLA: a second of it, to the servos' lag of 10 ms."""
+    task = dataclasses.replace(config.task, board_motions=("ramps", "sea"), platform=True)
+    env = BalanceEnv(dataclasses.replace(config, engine="mujoco", task=task))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
+    step = jax.jit(jax.vmap(env.step))
+    for _ in range(15):
+        state = step(state, np.full(4, 220))
+    scenario = jax.device_get(state.pipeline_state.scenario)
+    at = np.asarray(state.pipeline_state.physics.qpos)[:, env.scene.platform_qpos]
+    expected = platform_position(task, scenario, np.full((4, 1), 3.0))[:, 0]
+    np.testing.assert_allclose(at, expected, atol=0.004)
+    sailing = scenario.waves.amplitude.any(axis=(1, 2))
+    assert 0 < sailing.sum() < 4
+    assert (np.abs(at[sailing]).max(axis=1) > 0.01).all()
+    np.testing.assert_allclose(at[~sailing], 0, atol=0.001)
 
 
 def test_a_share_of_the_targets_fills_the_square(config: Config) -> None:

@@ -42,6 +42,7 @@ def make_view(
         root = scene.model.joint("robot/root").dofadr[0]
         qvel[:, root + 3 : root + 6] = np.radians(rates)
     view = View(
+        scene=scene,
         ids=np.arange(n),
         env_steps=0,
         obs=np.zeros((n, 34)),

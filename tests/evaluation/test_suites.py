@@ -9,22 +9,24 @@ import pytest
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig, preset
 from mjx_balance.envs.batch import Episodes, rows
-from mjx_balance.evaluation.controllers import make_controller
-from mjx_balance.evaluation.rollout import roll_out
+from mjx_balance.evaluation.controllers import View, make_controller
+from mjx_balance.evaluation.rollout import roll_out, run_suite, suite_scene
 from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.randomization import DRAWS, draw_params
-from mjx_balance.task.tilt import MOTIONS, board_angle, numpy_uniform
+from mjx_balance.task.tilt import MOTIONS, board_angle, numpy_uniform, platform_position
 
 
 def with_task(config: Config, **values: float) -> Config:
     return dataclasses.replace(config, task=dataclasses.replace(config.task, **values))
 
 
-def draw(config: Config, *rest: Any) -> Episodes:
-    return draw_suite(config.task, find_robot(config.robot), *rest)
+def draw(config: Config, suite: str, *rest: Any) -> Episodes:
+    """In a scene that fits the suite."""
+    task = dataclasses.replace(config.task, platform=suite == "platform")
+    return draw_suite(task, find_robot(config.robot), suite, *rest)
 
 
 def draws(seed: int, k: int, targets: int = 7) -> tuple[np.ndarray, np.ndarray]:
@@ -172,10 +174,67 @@ def test_the_board_goes_where_the_suite_says(config: Config, suite: str, most: f
     assert np.abs(error).max() < most
 
 
+def test_a_platform_has_the_sea_of_suite_sea(config: Config) -> None:
+    """With surge, sway and heave beside it; `sea` moves no platform, though the scene has one."""
+    sea, platform = (draw(config, name, 3, 60.0, 1).scenario.waves for name in ("sea", "platform"))
+    assert sea is not None
+    assert platform is not None
+    np.testing.assert_array_equal(platform.amplitude[..., :2], sea.amplitude)
+    np.testing.assert_array_equal(platform.omega, sea.omega)
+    np.testing.assert_allclose(platform.amplitude[..., 4], 1 / 8)
+    task = dataclasses.replace(config.task, platform=True)
+    still = draw_suite(task, find_robot(config.robot), "sea", 3, 60.0, 1).scenario.waves
+    assert still is not None
+    assert not still.amplitude[..., 2:].any()
+    with pytest.raises(SuiteError, match="'platform' moves a platform, which the scene does not"):
+        draw_suite(config.task, find_robot(config.robot), "platform", 1, 60.0, 1)
+    low = with_task(config, sea_period=1.0)
+    with pytest.raises(ConfigError, match=r"sea_height is 1.0 m; with sea_period 1.0 s"):
+        draw(low, "platform", 1, 60.0, 1)
+
+
+def test_a_standing_robot_feels_the_platforms_acceleration(config: Config) -> None:
+    """Where the deck does not tilt: the servos are 10 ms late, and the legs yield by a little."""
+    scene = suite_scene(load_scene(config), "platform")
+    scene = dataclasses.replace(scene, task=dataclasses.replace(scene.task, sea_angle=0.0))
+    episodes = draw_suite(scene.task, scene.robot, "platform", 2, 20.0, 1)
+    stand, felt = make_controller("none", scene), []
+
+    def watch(view: View) -> np.ndarray:
+        felt.append(view.imu[..., 3:])
+        return stand(view)
+
+    rollout = roll_out(scene, watch, episodes, 20.0, record=True)
+    assert rollout.qpos is not None
+    time = np.tile(0.004 * np.arange(1, 5001), (2, 1))
+    commanded = platform_position(scene.task, episodes.scenario, time)
+    at = rollout.qpos[..., scene.platform_qpos]
+    np.testing.assert_allclose(at, commanded, atol=0.004)
+    assert np.ptp(at, axis=1).min() > 0.1
+    assert rollout.tilt.max() < 0.1
+    acceleration = np.diff(commanded, 2, axis=1) / 0.004**2
+    imu = np.concatenate(felt[1:], axis=1)[:, 2500:] - (0, 0, 9.81)
+    expected = acceleration[:, 2495 : 2495 + imu.shape[1]]
+    assert expected.std(axis=1).min() > 0.05
+    np.testing.assert_allclose(imu, expected, atol=0.03)
+
+
+def test_baselines_run_on_a_platform(config: Config) -> None:
+    """Built in the scene without one, where the trunk has other addresses in qpos."""
+    scene = load_scene(config)
+    for name in ("pd-attitude", "rate-oracle"):
+        rollout = run_suite(scene, make_controller(name, scene), "platform", 2, 8.0, 0)
+        assert not rollout.fell.any()
+        assert rollout.tilt.mean() < 0.1
+
+
 def test_impossible_wishes_are_refused(config: Config) -> None:
     with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
         draw(config, "paper", 1, 10, -1)
-    names = "paper, corner, noise, payload, friction, gains, latency, push, fast, steep, steps, sea"
+    names = (
+        "paper, corner, noise, payload, friction, gains, latency, push, fast, steep, steps, sea, "
+        "platform"
+    )
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
         draw(config, "moon", 1, 10, 0)
 

@@ -10,6 +10,7 @@ import mujoco.viewer
 import numpy as np
 import pytest
 
+from mjx_balance.evaluation.rollout import suite_scene
 from mjx_balance.render import drawing
 from mjx_balance.render.drawing import PICTURE_SIZE, VIDEO_SIZE, RenderError, Window, write
 from mjx_balance.sim.scene import Scene
@@ -46,6 +47,21 @@ def test_a_picture_shows_the_board_as_it_stands(scene: Scene) -> None:
     assert level.std() > 20
     assert np.mean(level != other) > 0.02
     np.testing.assert_array_equal(again, other)
+
+
+def test_a_platform_carries_board_and_robot_through_the_picture(scene: Scene) -> None:
+    """Half a metre up, the board and its pedestal are elsewhere before the same floor."""
+    scene = suite_scene(scene, "platform")
+    raised = scene.stance.qpos.copy()
+    raised[scene.platform_qpos] = (0.3, 0.0, 0.5)
+    raised[scene.trunk_quat[0] - 3 : scene.trunk_quat[0]] += (0.3, 0.0, 0.5)
+    try:
+        painter = drawing.Painter(scene, (160, 90))
+    except RenderError as error:
+        pytest.skip(str(error))
+    with contextlib.closing(painter):
+        level, other = (painter.draw(x) for x in (scene.stance.qpos, raised))
+    assert np.mean(level != other) > 0.1
 
 
 @pytest.mark.parametrize(

@@ -329,3 +329,29 @@ def test_scene_file_stands_alone_and_is_primitive(path: Path) -> None:
     model = spec.compile()
     assert model.nmesh == model.nhfield == model.nskin == 0
     assert not [geom.name for geom in spec.geoms if geom.mass > 0]
+
+
+def test_a_platform_is_in_the_scene_only_if_the_config_asks(config: Config, scene: Scene) -> None:
+    """Scenes without one keep the fingerprint that the shipped policies were trained in."""
+    assert scene.hash == "010bfb541b4f54bb"
+    assert len(scene.platform_qpos) == len(scene.platform_ctrl) == 0
+    assert scene.model.nv == 20
+    moving = load_scene(with_task(config, platform=True, board_motions=("sea",)))
+    assert moving.hash != scene.hash
+    assert moving.model.nv == 23
+    names = [moving.model.joint(f"platform/{name}") for name in ("surge", "sway", "heave")]
+    assert moving.platform_qpos.tolist() == [joint.qposadr[0] for joint in names]
+    np.testing.assert_array_equal([joint.axis for joint in names], np.eye(3))
+    np.testing.assert_allclose(moving.stance.qpos[moving.platform_qpos[:2]], 0, atol=1e-9)
+    sag = (15.2 + 10 + 1) * 9.81 / 2e6  # robot, board and platform on the heave's servo
+    assert moving.stance.qpos[moving.platform_qpos[2]] == pytest.approx(-sag, rel=1e-3)
+    np.testing.assert_allclose(moving.stance.leg_trim, scene.stance.leg_trim, atol=1e-6)
+
+
+def test_a_platform_is_as_heavy_for_another_robot(config: Config) -> None:
+    """B2 is 5.493 times as heavy as ours: mass, stiffness and damping of the slides, too."""
+    task = dataclasses.replace(config.task, platform=True)
+    ours, b2 = (build_model(task, robot) for robot in ("quadruped", "b2"))
+    for field in ("dof_armature", "dof_damping"):
+        np.testing.assert_allclose(getattr(b2, field)[:3], 5.493 * getattr(ours, field)[:3])
+    np.testing.assert_allclose(b2.actuator_gainprm[:3, 0], 5.493 * 2e6)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjx_balance.config import TaskConfig
-from mjx_balance.config.sea import significant_angle
+from mjx_balance.config.sea import ACCELERATION, GRAVITY, check_platform, significant_angle
 from mjx_balance.envs.batch import stacked
 from mjx_balance.task.tilt import (
     MOTIONS,
@@ -22,6 +22,7 @@ from mjx_balance.task.tilt import (
     draw_scenario,
     num_targets,
     numpy_uniform,
+    platform_position,
 )
 
 TASK = TaskConfig()
@@ -235,6 +236,55 @@ def test_waves_tilt_the_board_in_the_direction_in_which_they_run() -> None:
     size = np.linalg.norm(waves.amplitude, axis=-1)
     expected = (size * np.sin(waves.omega * 23.0)).sum()
     assert np.degrees(slope @ along) == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_platform_moves_as_the_surface_of_the_sea() -> None:
+    """Airy's deep water: a deck that follows its surface feels gravity along its own normal.
+
+    With one wave, whose slope is k a = w^2 a / g, at every time.
+    """
+    task = dataclasses.replace(SEA, sea_heading=-40.0, platform=True)
+    sea = MOTIONS["sea"].draw(task, 2, lambda shape, low, high: np.full(shape, 0.3))
+    waves = sea.waves
+    assert waves is not None
+    height = np.linalg.norm(waves.amplitude[:, 2:4], axis=-1)
+    np.testing.assert_allclose(height, waves.amplitude[:, 4])
+    np.testing.assert_allclose((height**2).sum() / 2, 1.0 / 16)
+    one = Waves(*(x[3:4] for x in waves))
+    slope = np.degrees(one.omega[0] ** 2 * one.amplitude[0, 4] / 9.81)
+    tilt = one.amplitude[:, :2] * slope / np.linalg.norm(one.amplitude[:, :2])
+    raft = sea._replace(
+        waves=one._replace(amplitude=np.concatenate((tilt, one.amplitude[:, 2:]), axis=1))
+    )
+    time = np.arange(12.0, 30.0, 0.01)
+    x, y = np.radians(board_angle(task, raft, time)).T
+    acceleration = np.diff(platform_position(task, raft, time), 2, axis=0) / 0.01**2
+    felt = acceleration + np.asarray([0, 0, 9.81])
+    np.testing.assert_allclose(felt[:, 0] / felt[:, 2], y[1:-1], atol=1e-3)
+    np.testing.assert_allclose(felt[:, 1] / felt[:, 2], -x[1:-1], atol=1e-3)
+    assert np.ptp(felt[:, 1] / felt[:, 2]) > 5e-3
+
+
+def test_no_platform_falls_faster_than_the_bound() -> None:
+    """At the greatest height, with all waves aligned, it falls with g for a moment."""
+    task = dataclasses.replace(SEA, platform=True, sea_period=5.0)
+    highest = GRAVITY * 25 / ACCELERATION
+    task = dataclasses.replace(task, sea_height=highest)
+    check_platform(task)
+    worst = MOTIONS["sea"].draw(task, 2, lambda shape, low, high: np.zeros(shape))
+    assert worst.waves is not None
+    at = worst.waves.omega[:, None] * 5.0 * np.ones(5)
+    crest = worst._replace(waves=worst.waves._replace(phase=np.pi / 2 - at))
+    heave = platform_position(task, crest, np.arange(4.5, 7.0, 1e-3))[:, 2]
+    assert np.diff(heave, 2).min() / 1e-6 == pytest.approx(-9.81, rel=0.02)
+    assert np.diff(heave, 2).min() / 1e-6 > -9.82
+
+
+def test_without_a_sea_the_platform_rests(xp: types.ModuleType) -> None:
+    ramps = random_scenarios(3)._replace(waves=None)
+    still = platform_position(TASK, jax.tree.map(xp.asarray, ramps), xp.zeros((3, 7)))
+    assert still.shape == (3, 7, 3)
+    assert not still.any()
 
 
 def test_jumps_leave_room_before_a_fall() -> None:
