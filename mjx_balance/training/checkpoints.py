@@ -129,10 +129,12 @@ def restore(
             for damaged in steps[k + 1 :] if processes.first else ():
                 shutil.rmtree(directory / str(damaged))
             return state
-        log_fn(f"the checkpoint {path} is damaged" + ("; trying the one before" if k else ""))
+        cause = "holds the state of another version of mjx_balance" if whole else "is damaged"
+        log_fn(f"the checkpoint {path} {cause}" + ("; trying the one before" if k else ""))
     if steps:
         raise CheckpointError(
-            f"no checkpoint in {directory} is whole; start a new run with --run-dir"
+            f"no checkpoint in {directory} is whole and of this version; start a new run with "
+            "--run-dir"
         )
     return None
 

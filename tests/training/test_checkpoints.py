@@ -148,7 +148,9 @@ def test_none_is_whole(folder: Path) -> None:
     for name in ("5", "10"):
         shutil.rmtree(folder / name / "state")
     lines: list[str] = []
-    with pytest.raises(CheckpointError, match="is whole; start a new run with --run-dir"):
+    with pytest.raises(
+        CheckpointError, match="is whole and of this version; start a new run with --run-dir"
+    ):
         restore(folder, state_of(0), lines.append)
     assert len(lines) == 2
     assert saved_steps(folder) == [5, 10]  # nothing is thrown away then
@@ -156,8 +158,11 @@ def test_none_is_whole(folder: Path) -> None:
 
 @pytest.mark.parametrize("other", [State({}, jnp.int32(0)), {"a": jnp.zeros(2)}])
 def test_another_structure_is_refused(folder: Path, other: object) -> None:
-    with pytest.raises(CheckpointError, match="is whole"):
-        restore(folder, other, print)
+    lines: list[str] = []
+    with pytest.raises(CheckpointError, match="is whole and of this version"):
+        restore(folder, other, lines.append)
+    assert all("holds the state of another version of mjx_balance" in line for line in lines)
+    assert len(lines) == 2
 
 
 @settings(deadline=None, max_examples=60)
