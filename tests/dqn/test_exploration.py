@@ -30,11 +30,16 @@ def test_epsilon_is_linear_then_flat(
     assert float(linear_epsilon(config, jnp.int32(env_steps))) == pytest.approx(expected, rel=1e-6)
 
 
+@jax.jit
+def choose(epsilon: jax.Array) -> jax.Array:
+    """An action per key, of five; action 2 is the best."""
+    return jax.vmap(lambda key: epsilon_greedy(key, jnp.int32(2), epsilon, 5))(KEYS)
+
+
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
 def test_epsilon_greedy_shares(epsilon: float) -> None:
     """Five actions: epsilon / 5 each, and 1 - epsilon more for the best."""
-    draw = jax.vmap(lambda key: epsilon_greedy(key, jnp.int32(2), jnp.float32(epsilon), 5))
-    shares = np.bincount(np.asarray(draw(KEYS)), minlength=5) / len(KEYS)
+    shares = np.bincount(choose(np.float32(epsilon)), minlength=5) / len(KEYS)
     expected = np.full(5, epsilon / 5)
     expected[2] += 1 - epsilon
     np.testing.assert_allclose(shares, expected, atol=0.015 if epsilon else 0)
@@ -42,8 +47,8 @@ def test_epsilon_greedy_shares(epsilon: float) -> None:
 
 def noise_shares(action: int, levels: int) -> np.ndarray:
     """Shares of the actions of (9, 7) that noise makes of one of them."""
-    draw = jax.vmap(lambda key: exploration_noise(key, jnp.int32(action), (9, 7), levels))
-    drawn = draw(KEYS)
+    noise = lambda key: exploration_noise(key, jnp.int32(action), (9, 7), levels)  # noqa: E731
+    drawn = jax.jit(jax.vmap(noise))(KEYS)
     assert drawn.dtype == jnp.int32
     return np.bincount(drawn, minlength=63).reshape(9, 7) / len(KEYS)
 
@@ -74,7 +79,7 @@ def actions(epsilon: float, levels: int) -> np.ndarray:
     stub: Any = Favourite()
     spec = DQNSpec(DQNConfig(exploration_noise=levels), 2, 2, action_factors=(9,))
     act = jax.vmap(DQN(stub, stub, spec).act, (None, None, 0, None))
-    return np.asarray(act(None, jnp.zeros(1), KEYS, jnp.float32(epsilon)))
+    return np.asarray(jax.jit(act)(None, jnp.zeros(1), KEYS, jnp.float32(epsilon)))
 
 
 def test_noise_is_independent_of_the_action_that_it_moves() -> None:

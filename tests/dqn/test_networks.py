@@ -73,11 +73,12 @@ def some_heads(batch: tuple[int, ...], seed: int) -> list[heads.Head]:
     ]
 
 
-def in_jax(head: heads.Head) -> heads.Head:
-    if isinstance(head, heads.Additive):
-        return heads.Additive(jnp.asarray(head.branches), head.factors)
-    out, profile, stretch = map(jnp.asarray, (head.out, head.profile, head.stretch))
-    return heads.Radial(out, profile, stretch, head.factors)
+def results(head: heads.Head, action: Any) -> tuple[Any, Any, Any]:
+    return head.q_values(), head.q_value(action), head.argmax()
+
+
+def results_of(kind: Any, factors: Any, arrays: Any, action: Any) -> tuple[Any, Any, Any]:
+    return results(kind(*arrays, factors), action)
 
 
 @pytest.mark.parametrize("batch", [(), (2, 3)])
@@ -85,14 +86,10 @@ def test_heads_give_numpy_and_jax_the_same(batch: tuple[int, ...]) -> None:
     rng = np.random.default_rng(4)
     action = rng.integers(24, size=batch)
     for plain in some_heads(batch, 3):
-        traced = in_jax(plain)
-        for a, b in (
-            (plain.q_values(), traced.q_values()),
-            (plain.q_value(action), traced.q_value(jnp.asarray(action))),
-            (plain.argmax(), traced.argmax()),
-        ):
+        *arrays, factors = vars(plain).values()
+        traced = jax.jit(functools.partial(results_of, type(plain), factors))
+        for a, b in zip(results(plain, action), traced(arrays, action), strict=True):
             assert not isinstance(a, jax.Array)
-            assert isinstance(b, jax.Array)
             assert a.shape == b.shape
             assert a.dtype in (np.float32, np.int32, np.int64)
             np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5)

@@ -1,5 +1,7 @@
 """The replay ring, proved with rows that carry their own id, and reflections of its batches."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,8 @@ from mjx_balance.dqn.replay import ReplayState, Transition, reflect
 from mjx_balance.task.symmetry import Symmetries
 
 BATCH, CAPACITY = 4, 12
+add = jax.jit(replay.add)
+sample = jax.jit(replay.sample, static_argnums=2)
 
 
 def rows(first: int, count: int = BATCH) -> Transition:
@@ -18,14 +22,14 @@ def rows(first: int, count: int = BATCH) -> Transition:
     ids = np.arange(first, first + count, dtype=np.int32)
     real = ids.astype(np.float32)
     obs = np.stack((real, -real), axis=-1)
-    fields = (obs, ids, real + 0.25, (ids % 3 == 0).astype(np.float32), obs + 0.5)
-    return Transition(*map(jnp.asarray, fields))
+    fields: Any = (obs, ids, real + 0.25, (ids % 3 == 0).astype(np.float32), obs + 0.5)
+    return Transition(*fields)
 
 
 def filled(batches: int, capacity: int = CAPACITY) -> ReplayState:
     state = replay.init(jax.tree.map(lambda x: x[0], rows(0)), capacity, BATCH)
     for k in range(batches):
-        state = replay.add(state, rows(1 + BATCH * k))
+        state = add(state, rows(1 + BATCH * k))
     return state
 
 
@@ -55,7 +59,7 @@ def test_ring_holds_exactly_the_newest_rows(batches: int) -> None:
 def test_an_invalid_batch_changes_nothing() -> None:
     for batches in range(5):
         state = filled(batches)
-        after = replay.add(state, rows(100), jnp.bool_(False))
+        after = add(state, rows(100), jnp.bool_(False))
         jax.tree.map(np.testing.assert_array_equal, state, after)
 
 
@@ -74,13 +78,13 @@ def test_batches_that_do_not_fit_are_refused() -> None:
 
 
 def test_no_empty_row_is_sampled_before_the_ring_is_full() -> None:
-    drawn = replay.sample(filled(2), jax.random.PRNGKey(0), 500)
+    drawn = sample(filled(2), jax.random.PRNGKey(0), 500)
     assert set(drawn.action.tolist()) == set(range(1, 9))
 
 
 def test_sampling_is_uniform_over_all_rows_and_keeps_them_whole() -> None:
     """12 rows share 12000 draws: 1000 each, give or take 5 standard deviations."""
-    drawn = replay.sample(filled(5), jax.random.PRNGKey(1), 12_000)
+    drawn = sample(filled(5), jax.random.PRNGKey(1), 12_000)
     counts = np.bincount(drawn.action)[9:]
     assert len(counts) == CAPACITY
     assert np.abs(counts - 1000).max() < 150
@@ -99,11 +103,17 @@ def test_add_in_place_under_jit_equals_add() -> None:
 COUNT = 400
 
 
+def turned(batch: Transition, group: Symmetries, seed: int) -> Transition:
+    turn = jax.jit(lambda batch, key: reflect(batch, group, key))
+    return jax.device_get(turn(batch, jax.random.PRNGKey(seed)))
+
+
 def test_a_reflection_changes_observations_and_action_together() -> None:
-    obs = jnp.linspace(0.1, 1, COUNT)[:, None]
-    ended = (jnp.arange(COUNT) % 3 == 0).astype(jnp.float32)
-    batch = Transition(obs, jnp.zeros(COUNT, int), obs[:, 0], ended, 2 * obs)
-    got = reflect(batch, probes.PositiveState.symmetries, jax.random.PRNGKey(0))
+    obs = np.linspace(0.1, 1, COUNT, dtype=np.float32)[:, None]
+    ended = (np.arange(COUNT) % 3 == 0).astype(np.float32)
+    fields: Any = (obs, np.zeros(COUNT, np.int32), obs[:, 0], ended, 2 * obs)
+    batch = Transition(*fields)
+    got = turned(batch, probes.PositiveState.symmetries, 0)
     flipped = np.asarray(got.action) == 1
     assert 0.4 < flipped.mean() < 0.6
     sign = np.where(flipped, -1.0, 1.0)[:, None]
@@ -118,9 +128,10 @@ def test_reflections_that_are_not_their_own_inverses() -> None:
     turns = np.asarray([[0, 1, 2], [1, 2, 0], [2, 0, 1]], np.int32)
     sign = np.asarray([[1, 1, 1], [1, -1, 1], [1, 1, -1]], np.float32)
     group = Symmetries(turns, sign, turns)
-    obs = jnp.asarray([[10.0, 20.0, 30.0]] * COUNT)
-    batch = Transition(obs, jnp.full(COUNT, 1), obs[:, 0], obs[:, 0], obs + 1)
-    got = jax.device_get(reflect(batch, group, jax.random.PRNGKey(1)))
+    obs = np.asarray([[10.0, 20.0, 30.0]] * COUNT, np.float32)
+    fields: Any = (obs, np.full(COUNT, 1, np.int32), obs[:, 0], obs[:, 0], obs + 1)
+    batch = Transition(*fields)
+    got = turned(batch, group, 1)
     expected = {1: (10, 20, 30), 2: (20, -30, 10), 0: (30, 10, -20)}
     after = {1: (11, 21, 31), 2: (21, -31, 11), 0: (31, 11, -21)}
     for row, action in enumerate(got.action.tolist()):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any
 
 import jax
@@ -56,7 +57,7 @@ def test_loss_is_linear_in_errors_beyond_delta() -> None:
     batch = Transition(zeros[:, None], zeros.astype(int), rewards, zeros, zeros[:, None])
     config = DQNConfig(gamma=0, huber_delta=0.5)
     q = jnp.zeros((1, 1))
-    value, slope = jax.value_and_grad(table_loss)(q, q, batch, config)
+    value, slope = jax.jit(jax.value_and_grad(partial(table_loss, config=config)))(q, q, batch)
     assert float(value) == pytest.approx((0.09 + 1.75 + 4.75) / 3)
     assert slope.item() == pytest.approx((-2 * 0.3 - 2 * 0.5 + 2 * 0.5) / 3)
 
@@ -67,7 +68,7 @@ def test_loss_is_the_mean_over_the_batch() -> None:
     action, reward = np.asarray([0, 1, 2, 1, 0]), np.arange(5.0)
     terminated, states = np.asarray([0.0, 1, 0, 0, 1]), np.arange(5.0)[:, None]
     batch = Transition(*map(jnp.asarray, (states, action, reward, terminated, states)))
-    got = table_loss(jnp.asarray(q_tm1), jnp.asarray(q_t), batch, DQNConfig(gamma=0.3))
+    got = jax.jit(partial(table_loss, config=DQNConfig(gamma=0.3)))(q_tm1, q_t, batch)
     errors = reward + 0.3 * (1 - terminated) * q_t.max(axis=-1) - q_tm1[np.arange(5), action]
     assert float(got) == pytest.approx(np.mean(errors**2), rel=1e-5)
 
@@ -75,11 +76,13 @@ def test_loss_is_the_mean_over_the_batch() -> None:
 def steps(config: DQNConfig, total: int, count: int) -> list[float]:
     """Adam's steps for a gradient that never changes: minus the learning rate."""
     optimizer = make_optimizer(config, total)
-    state, rates = optimizer.init(jnp.zeros(())), []
-    for _ in range(count):
+
+    def step(state: Any, _: None) -> tuple[Any, Any]:
         update, state = optimizer.update(jnp.ones(()), state)
-        rates.append(float(np.asarray(update)))
-    return rates
+        return state, update
+
+    run = jax.jit(lambda: jax.lax.scan(step, optimizer.init(jnp.zeros(())), length=count)[1])
+    return run().tolist()
 
 
 def test_learning_rate_is_a_cosine_from_its_start_to_its_end() -> None:

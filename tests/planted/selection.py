@@ -11,8 +11,9 @@ CLI = "mjx_balance.cli"
 """Imports its commands by name; `train.py` starts it."""
 
 
+@functools.cache
 def parsed(file: Path) -> ast.Module:
-    """A file's syntax tree."""
+    """A file's syntax tree; do not modify it."""
     return ast.parse(file.read_text())
 
 

@@ -7,7 +7,8 @@ words: legs of two links of 0.213 m, feet of 22 mm, a board that walks at its ra
 import dataclasses
 import math
 import types
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -82,6 +83,21 @@ def put(xp: types.ModuleType, tree: Any) -> Any:
     return jax.tree.map(lambda x: xp.asarray(x, int if x.dtype == int else float), tree)
 
 
+@pytest.fixture(scope="module")
+def apply(robot: Robot) -> Callable[..., Any]:
+    """Array library, function, task, arrays -> its results; JAX compiles a function once."""
+
+    @cache
+    def compiled(function: Any, task: TaskConfig) -> Any:
+        return jax.jit(partial(function, task, robot))
+
+    def apply(xp: types.ModuleType, function: Any, task: TaskConfig, *arrays: Any) -> Any:
+        of_task = partial(function, task, robot) if xp is np else compiled(function, task)
+        return of_task(*put(xp, arrays))
+
+    return apply
+
+
 def tolerance(xp: types.ModuleType) -> float:
     return 1e-12 if xp is np else 3e-6
 
@@ -101,12 +117,12 @@ def test_a_standing_robot_has_always_stood(
 
 
 def test_targets_of_legs_and_board_step_by_step(
-    xp: types.ModuleType, task: TaskConfig, robot: Robot, walked: Any
+    xp: types.ModuleType, task: TaskConfig, apply: Any, walked: Any
 ) -> None:
     delay, env_steps = (0.0, 1.0, 0.0), (7, 31, 52)
     state = before(env_steps, delay)
     memory = state.memory
-    after, targets = step.pre_step(task, robot, put(xp, state), put(xp, CHANGE))
+    after, targets = apply(xp, step.pre_step, task, state, CHANGE)
     last = memory.commanded[:, -1]
     command = last + [[x * a + y * b for x, y in SIGNS] for a, b in CHANGE]
     goal = np.where(np.asarray(delay)[:, None] > 0, last, command)
@@ -146,16 +162,16 @@ def test_heights_stop_at_the_legs_reach(task: TaskConfig, robot: Robot) -> None:
 
 
 def test_a_delayed_action_is_commanded_at_once_and_taken_one_decision_later(
-    xp: types.ModuleType, task: TaskConfig, robot: Robot
+    xp: types.ModuleType, task: TaskConfig, robot: Robot, apply: Any
 ) -> None:
     """Three raises of the left side by 1, 2 and 3 mm: commanded 1, 3, 6; taken 0, 1, 3."""
     memory = step.initial_memory(task, robot, put(xp, np.zeros((2, 6))))
     level = Scenario(np.zeros((2, 1, 2)), np.zeros(2), np.full(2, 3.5))
     commanded, taken, first = [], [], []
     for number, millimetres in enumerate((1, 2, 3)):
-        state = put(xp, before([number] * 2, (0.0, 1.0), memory, level))
-        change = put(xp, np.asarray([(millimetres * 1e-3, 0.0)] * 2))
-        memory, targets = step.pre_step(task, robot, state, change)
+        state = before([number] * 2, (0.0, 1.0), memory, level)
+        change = np.asarray([(millimetres * 1e-3, 0.0)] * 2)
+        memory, targets = apply(xp, step.pre_step, task, state, change)
         commanded.append(1e3 * (np.asarray(memory.commanded)[:, -1, 0] - 0.35))
         taken.append(1e3 * (np.asarray(memory.heights)[:, 0] - 0.35))
         # The first targets of the knees: a fifth of the way from where they were.
@@ -173,10 +189,10 @@ def test_without_a_delay_actions_are_taken_at_once(task: TaskConfig, robot: Robo
     jax.tree.map(np.testing.assert_array_equal, *results)
 
 
-def test_observation_entry_by_entry(xp: types.ModuleType, task: TaskConfig, robot: Robot) -> None:
+def test_observation_entry_by_entry(xp: types.ModuleType, task: TaskConfig, apply: Any) -> None:
     """Measured heights, commands of now and two decisions ago, gyro, accelerometer."""
     memory, motion = random_memory(), random_motion()
-    after, outcome = step.post_step(task, robot, *put(xp, (memory, motion)))
+    after, outcome = apply(xp, step.post_step, task, memory, motion)
     assert outcome.obs.shape == (N, 4 + 8 + 4 + 4)
     for n in range(N):
         stream = [*memory.imu[n], *motion.imu[n]]
@@ -206,9 +222,7 @@ def test_observation_entry_by_entry(xp: types.ModuleType, task: TaskConfig, robo
 
 
 @pytest.mark.parametrize("rewarded", ["end", "mean"])
-def test_rewards_by_hand(
-    xp: types.ModuleType, task: TaskConfig, robot: Robot, rewarded: Any
-) -> None:
+def test_rewards_by_hand(xp: types.ModuleType, task: TaskConfig, apply: Any, rewarded: Any) -> None:
     """The tilt before is the one that was rewarded last, not that of the last step."""
     task = dataclasses.replace(
         task,
@@ -223,7 +237,7 @@ def test_rewards_by_hand(
     for seed in (1, 2, 3):
         motion = random_motion(seed)
         tilts = motion.tilt * np.asarray([[0.1], [0.5], [1.0]])
-        memory, outcome = step.post_step(task, robot, memory, put(xp, motion._replace(tilt=tilts)))
+        memory, outcome = apply(xp, step.post_step, task, memory, motion._replace(tilt=tilts))
         after = [row[-1] if rewarded == "end" else sum(row) / 50 for row in tilts]
         close(outcome.rewards["level"], [0.4 * math.exp(-1.5 * x) for x in after])
         gain = [(a - b) / 2.5 for a, b in zip(tilt_before, after, strict=True)]
@@ -236,12 +250,12 @@ def test_rewards_by_hand(
 
 @pytest.mark.parametrize("number", [0, 23, 49])
 def test_one_step_beyond_six_degrees_is_a_fall(
-    xp: types.ModuleType, task: TaskConfig, robot: Robot, number: int
+    xp: types.ModuleType, task: TaskConfig, apply: Any, number: int
 ) -> None:
     motion = random_motion()
     motion.tilt[:, number] = 6.0, 6.001, 6.001
     motion.tilt[2, number:] = 6.001
-    _, outcome = step.post_step(task, robot, *put(xp, (random_memory(), motion)))
+    _, outcome = apply(xp, step.post_step, task, random_memory(), motion)
     np.testing.assert_array_equal(outcome.terminated, (False, True, True))
     np.testing.assert_allclose(outcome.rewards["fail"], (0, -0.5, -0.5))
     np.testing.assert_allclose(outcome.tilt, motion.tilt, rtol=1e-6)
@@ -251,14 +265,14 @@ def test_one_step_beyond_six_degrees_is_a_fall(
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38, 2e4, -2e4])
 @pytest.mark.parametrize("name", ["imu", "tilt", "joint_angles"])
 def test_a_diverged_env_is_a_fall_with_finite_values(
-    xp: types.ModuleType, task: TaskConfig, robot: Robot, name: str, value: float
+    xp: types.ModuleType, task: TaskConfig, apply: Any, name: str, value: float
 ) -> None:
     """Its last sample is held, its legs count as at their targets; the others do not notice."""
     memory, motion = random_memory(), random_motion()
-    sound = step.post_step(task, robot, *put(xp, (memory, motion)))
+    sound = apply(xp, step.post_step, task, memory, motion)
     getattr(motion, name)[1].reshape(-1)[-1] = value
     with np.errstate(over="ignore", invalid="ignore"):
-        after, outcome = step.post_step(task, robot, *put(xp, (memory, motion)))
+        after, outcome = apply(xp, step.post_step, task, memory, motion)
     jax.tree.map(
         lambda a, b: np.testing.assert_array_equal(np.asarray(a)[::2], np.asarray(b)[::2]),
         (after, outcome),

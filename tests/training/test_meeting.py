@@ -58,6 +58,12 @@ def message(outcome: Any) -> str:
     return str(outcome)
 
 
+def wait_for(condition: Callable[[], object]) -> None:
+    until = time.monotonic() + 10
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.01)
+
+
 def test_all_get_to_know_of_all(come: Any) -> None:
     calls = [lambda k=k: come(k, 3) for k in (2, 1, 0)]
     assert at_once(*calls) == [["machine 0", "machine 1", "machine 2"]] * 3
@@ -144,10 +150,11 @@ def test_strangers_neither_end_nor_block_the_meeting(
         with contextlib.suppress(OSError):  # it has been dropped
             for line in lines:
                 opened[-1].sendall(line)
-                time.sleep(0.1)
+                time.sleep(0.02)
 
     def second() -> Any:
-        time.sleep(0.5)
+        wait_for(lambda: len(opened) == 4)
+        time.sleep(0.1)
         return come(1, 2)
 
     began = time.monotonic()
@@ -171,25 +178,32 @@ def scan(callers: list[socket.socket]) -> None:
 
 @pytest.mark.parametrize("behave", [len, say_little, scan], ids=["idle", "slow", "reset"])
 def test_no_number_of_strangers_keeps_a_process_out(
-    behave: Callable[[list[socket.socket]], Any], address: Address, come: Any
+    behave: Callable[[list[socket.socket]], Any],
+    address: Address,
+    monkeypatch: pytest.MonkeyPatch,
+    come: Any,
 ) -> None:
     """Three times as many as may wait, and more of them until the end."""
-    over = threading.Event()
+    monkeypatch.setattr(meeting, "CALLERS", 30)
+    full, over = threading.Event(), threading.Event()
 
     def flood() -> None:
-        callers = [knock(address)]
+        callers, came = [knock(address)], 0
         with contextlib.suppress(OSError):  # the meeting is over
             while not over.is_set():
                 callers.append(knock(address, 0.1))
+                came += 1
                 behave(callers)
+                if came > 3 * meeting.CALLERS:
+                    full.set()
+                    time.sleep(0.01)
                 if len(callers) > 3 * meeting.CALLERS:
                     callers.pop(0).close()
-                    time.sleep(0.01)
         for caller in callers:
             caller.close()
 
     def second() -> Any:
-        time.sleep(1.5)
+        full.wait(10)
         try:
             return come(1, 2)
         finally:
@@ -203,7 +217,7 @@ def test_a_byte_a_second_is_no_hello(
     address: Address, monkeypatch: pytest.MonkeyPatch, opened: Any, come: Any
 ) -> None:
     """However many come: the time for a hello is counted from its first byte."""
-    monkeypatch.setattr(meeting, "HELLO_S", 0.5)
+    monkeypatch.setattr(meeting, "HELLO_S", 0.2)
 
     def drip() -> float:
         opened.append(knock(address))
@@ -214,8 +228,8 @@ def test_a_byte_a_second_is_no_hello(
                 time.sleep(0.1)
         return time.monotonic() - began
 
-    _, seconds = at_once(lambda: come(0, 2, 3), drip)
-    assert seconds < 2
+    _, seconds = at_once(lambda: come(0, 2, 1.5), drip)
+    assert seconds < 1.2
 
 
 def test_a_process_that_was_killed_may_come_again(address: Address, come: Any) -> None:
@@ -257,16 +271,24 @@ def test_whoever_comes_after_the_meeting_is_told(address: Address, come: Any) ->
 def test_another_service_at_the_address_is_not_joined(
     banner: bytes, address: Address, opened: Any, come: Any
 ) -> None:
+    over = threading.Event()
+
     def service() -> None:
         with socket.create_server(address) as server:
-            server.settimeout(2)
-            with contextlib.suppress(OSError):
-                while True:
+            server.settimeout(0.05)
+            while not over.is_set():
+                with contextlib.suppress(OSError):
                     opened.append(server.accept()[0])
                     opened[-1].sendall(banner)
 
-    [outcome, _] = at_once(lambda: come(1, 2, 1), service)
-    assert "within 1 s (what answers is no process 0); is it started" in message(outcome)
+    def visitor() -> Any:
+        try:
+            return come(1, 2, 0.6)
+        finally:
+            over.set()
+
+    [outcome, _] = at_once(visitor, service)
+    assert "within 0.6 s (what answers is no process 0); is it started" in message(outcome)
 
 
 @pytest.mark.parametrize(
@@ -312,12 +334,6 @@ def pairs() -> Iterator[list[tuple[socket.socket, socket.socket]]]:
     for pair in connections:
         for end in pair:
             end.close()
-
-
-def wait_for(condition: Callable[[], object]) -> None:
-    until = time.monotonic() + 10
-    while not condition() and time.monotonic() < until:
-        time.sleep(0.01)
 
 
 def test_a_lost_process_ends_all_with_a_sentence(
