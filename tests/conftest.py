@@ -24,7 +24,10 @@ pytest_plugins = ("fixtures.bodies", "fixtures.fleet")
 
 jax.config.update("jax_num_cpu_devices", 2)
 # The suite compiles longer than it computes. XLA reads this when its first device is asked for.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+XLA_FLAGS = "--xla_backend_optimization_level=0"
+if jax.__version_info__ < (0, 10):  # a third of the time; a later XLA has no such flag
+    XLA_FLAGS += " --xla_cpu_use_fusion_emitters=false"
+os.environ.setdefault("XLA_FLAGS", XLA_FLAGS)
 # Imports and traces make millions of objects that live on: with the usual 700, the collector walks
 # through them for a tenth of the time.
 gc.set_threshold(100_000, 20, 100)
@@ -95,6 +98,12 @@ def robot() -> Robot:
 def xp(request: pytest.FixtureRequest) -> types.ModuleType:
     """Both array libraries that the task's functions run on."""
     return request.param
+
+
+@pytest.fixture
+def compiled(xp: types.ModuleType) -> Callable[..., Any]:
+    """Function -> the same, compiled by JAX if arrays are JAX's: operation by operation is slow."""
+    return jax.jit if xp is jnp else lambda function: function
 
 
 @pytest.fixture

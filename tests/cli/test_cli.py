@@ -246,27 +246,27 @@ def test_impossible_commands_are_refused(
 def test_evaluate_writes_figures_and_a_video(
     who: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, read_video: Any
 ) -> None:
-    """0.4 s of a baseline and of a policy, to the end of the command."""
+    """0.2 s of a baseline and of a policy, to the end of the command."""
     names = ("--controller", "pd-imu") if who == "controller" else (str(SHIPPED),)
-    flags = "--suite corner --scenarios 2 --duration 0.4 --seed 5 --json out.json --video v.mp4"
+    flags = "--suite corner --scenarios 2 --duration 0.2 --seed 5 --json out.json --video v.mp4"
     code = main(("evaluate", *names, *flags.split()))
     said = capsys.readouterr()
     result = json.loads((tmp_path / "out.json").read_text())
     scene = load_scene(preset("default" if who == "controller" else "best"))
     ours = observing(load_policy(SHIPPED)) if who == "policy" else make_controller("pd-imu", scene)
-    rollout = run_suite(scene, ours, "corner", 2, 0.4, 5)
-    expected = summarize(rollout, "corner", 0.4, 5)
+    rollout = run_suite(scene, ours, "corner", 2, 0.2, 5)
+    expected = summarize(rollout, "corner", 0.2, 5)
     speeds = [found.pop("physics_steps_per_second") for found in (result, expected)]
     assert result == expected
-    assert result["duration_s"] == 0.4
-    assert "corner  2 x 0.4 s      0" in said.out
+    assert result["duration_s"] == 0.2
+    assert "corner  2 x 0.2 s      0" in said.out
     assert f"{speeds[0]:,.0f} physics steps per second" in said.out
     if code == 1 and "no video written" in said.err:
         pytest.skip(said.err)
     assert code == 0
     assert "video of the first scenario: v.mp4" in said.out
     fps, frames = read_video(tmp_path / "v.mp4")
-    assert (fps, len(frames), frames.shape[1:3]) == (25, 10, VIDEO_SIZE[::-1])
+    assert (fps, len(frames), frames.shape[1:3]) == (25, 5, VIDEO_SIZE[::-1])
     assert np.abs(frames[-1] - frames[0]).mean() > 0.1, "the board moves"
 
 

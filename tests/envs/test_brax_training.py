@@ -78,7 +78,7 @@ def test_a_continuous_action_is_two_numbers(env: BalanceEnv) -> None:
     """Those beyond -1 and 1 count as these; between two levels of the grid lies a third."""
     assert env.action_size == 2
     given = jnp.array([[1.0, -1.0], [7.0, -jnp.inf], [0.123, -0.456]])
-    start = jax.vmap(env.reset)(jnp.stack([keys(1)[0]] * 3))
+    start = jax.jit(jax.vmap(env.reset))(jnp.stack([keys(1)[0]] * 3))
     after = jax.device_get(jax.jit(jax.vmap(env.step))(start, given))
     for leaf in jax.tree.leaves(after):
         np.testing.assert_array_equal(leaf[0], leaf[1])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import types
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ def observed(task: TaskConfig, robot: Robot, *signals: Any) -> Any:
     return observe(input_rows(task, robot), Signals(*signals))
 
 
-def test_commands_and_means_by_hand(xp: types.ModuleType, robot: Robot) -> None:
+def test_commands_and_means_by_hand(xp: types.ModuleType, robot: Robot, compiled: Any) -> None:
     """Samples k read k: the mean of 15, 14 and 13 is 14, that of 11, 10 and 9 is 10.
 
     0.345 m is 5 mm below the standing height, and 0.341 m 9 mm.
@@ -44,7 +45,8 @@ def test_commands_and_means_by_hand(xp: types.ModuleType, robot: Robot) -> None:
     task = dataclasses.replace(
         UNSCALED, gyro_lags=(0, 4), accel_lags=(0,), imu_mean=3, command_lags=(0, 1)
     )
-    got = observed(task, robot, *map(xp.asarray, (HEIGHTS, COMMANDS, readable_history()[-7:])))
+    signals = map(xp.asarray, (HEIGHTS, COMMANDS, readable_history()[-7:]))
+    got = compiled(partial(observed, task, robot))(*signals)
     commanded = (-0.005, -0.004, -0.003, -0.002, -0.009, -0.008, -0.007, -0.006)
     np.testing.assert_allclose(got[4:12], commanded, atol=1e-6)
     np.testing.assert_allclose(got[12:], (14, 10, 114, 110, 314, 414), rtol=1e-6)

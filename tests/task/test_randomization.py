@@ -1,6 +1,8 @@
 """Random numbers become domain parameters: each its own, over the whole of its range."""
 
 import types
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +24,12 @@ RANDOM = RandomizationConfig(
 )
 
 
-def test_every_draw_lands_in_its_own_field(xp: types.ModuleType, robot: Robot) -> None:
+def test_every_draw_lands_in_its_own_field(
+    xp: types.ModuleType, robot: Robot, compiled: Any
+) -> None:
     """Payload, its place on x and on y, friction, gain, delay, by hand; noise per channel."""
     draws = ([0.1, 0.2, 0.7, 0.25, 0.9, 0.2], [0.0] * 6, [1 - 1e-7] * 6)
-    got = draw_params(RANDOM, robot, xp.asarray(draws))
+    got = compiled(partial(draw_params, RANDOM, robot))(xp.asarray(draws))
     np.testing.assert_allclose(got.imu_noise, [(0.01,) * 3 + (0.2,) * 3] * 3, rtol=1e-6)
     np.testing.assert_allclose(got.payload, (0.5, 0, 5), rtol=1e-6)
     at = [(-0.024, 0.016, 0.07), (-0.04, -0.04, 0.07), (0.04, 0.04, 0.07)]
@@ -61,12 +65,15 @@ def test_the_paper_leaves_everything_as_it_is(robot: Robot) -> None:
     assert (got.payload, got.friction, got.gain, got.delay) == (0.0, 0.8, 1.0, 0.0)
 
 
-def test_a_batch_keeps_its_shape_and_type(xp: types.ModuleType, robot: Robot) -> None:
+def test_a_batch_keeps_its_shape_and_type(
+    xp: types.ModuleType, robot: Robot, compiled: Any
+) -> None:
     uniform = xp.asarray(np.random.default_rng(0).uniform(size=(2, 3, DRAWS)), xp.float32)
-    got = draw_params(RANDOM, robot, uniform)
+    draw = compiled(partial(draw_params, RANDOM, robot))
+    got = draw(uniform)
     shapes = DomainParams((2, 3, 6), (2, 3), (2, 3, 3), (2, 3), (2, 3), (2, 3))
     assert DomainParams(*(value.shape for value in got)) == shapes
     assert {value.dtype for value in got} == {np.dtype(np.float32)}
-    alone = draw_params(RANDOM, robot, uniform[1, 2])
+    alone = draw(uniform[1, 2])
     for whole, one in zip(got, alone, strict=True):
         np.testing.assert_array_equal(whole[1, 2], one)

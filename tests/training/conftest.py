@@ -120,7 +120,8 @@ class StubLearner:
         config = preset("smoke")
         self.network = QNetwork(config.dqn.hidden_sizes, (21, 21), radial=True)
         self.obs_size = len(observation_names(config.task, find_robot(config.robot)))
-        self.params: Any = self.network.init(jax.random.PRNGKey(0), jnp.zeros(self.obs_size))
+        init = jax.jit(self.network.init)
+        self.params: Any = init(jax.random.PRNGKey(0), jnp.zeros(self.obs_size))
         self.first_weight = float(self.params["params"]["hidden_0"]["kernel"].ravel()[0])
 
     def export_params(self, state: StubState) -> Any:

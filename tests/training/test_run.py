@@ -18,8 +18,8 @@ from mjx_balance.training.checkpoints import saved_steps
 
 KILLS, STARTS = (int(os.environ.get(f"MJX_BALANCE_{name}", 3)) for name in ("KILLS", "STARTS"))
 FLAGS = (
-    "--preset smoke --engine mujoco --num-env-steps 6144 --eval-scenarios 8 --eval-duration 10 "
-    "--checkpoint-seconds 1"
+    "--preset smoke --engine mujoco --num-env-steps 4096 --eval-every 3072 --eval-scenarios 2 "
+    "--eval-duration 5 --checkpoint-seconds 1"
 ).split()
 
 
@@ -45,19 +45,19 @@ def test_a_run_leaves_everything_behind(run: RunFolder) -> None:
     figures = {"learning_curves.png", "reward.png", "rollout.png"}
     assert {path.name for path in run.figures.iterdir()} == figures
     assert list(run.tensorboard.iterdir())
-    assert (run.checkpoints / "6144").is_dir()
+    assert (run.checkpoints / "4096").is_dir()
     results = json.loads(run.evaluation.read_text())
     assert set(results) == {"paper", "corner"}
-    assert results["corner"]["scenarios"] == 8
+    assert results["corner"]["scenarios"] == 2
     assert json.loads(run.config.read_text())["preset"] == "smoke"
     policy = load_policy(run.policy)
-    assert policy.manifest["training"]["env_steps"] == 6144
+    assert policy.manifest["training"]["env_steps"] == 4096
     assert policy(np.zeros((3, policy.observation_size))).shape == (3,)
 
 
 def test_metrics_are_logged_and_the_loss_falls(run: RunFolder) -> None:
     logged = lines(run)
-    assert [x["env_steps"] for x in logged] == list(range(1024, 6145, 1024))
+    assert [x["env_steps"] for x in logged] == list(range(1024, 4097, 1024))
     for line in logged:
         for name in "tilt_deg falls_per_minute reward loss epsilon".split():
             assert f"train/{name}" in line
@@ -81,10 +81,10 @@ def validated(folder: RunFolder) -> dict[str, str]:
 
 
 def test_greedy_policies_are_validated_on_the_way(run: RunFolder) -> None:
-    assert [steps for steps, *_ in held_out(run)] == [4096, 6144]
+    assert [steps for steps, *_ in held_out(run)] == [3072, 4096]
     policies = validated(run)
-    assert list(policies) == [f"validated/{n}/seed-0.safetensors" for n in (4096, 6144)]
-    last = policies["validated/6144/seed-0.safetensors"]
+    assert list(policies) == [f"validated/{n}/seed-0.safetensors" for n in (3072, 4096)]
+    last = policies["validated/4096/seed-0.safetensors"]
     assert last == load_policy(run.policy).fingerprint
 
 
@@ -107,7 +107,7 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
         return start_train("--resume", folder.path)
 
     resume().interrupt(signal.SIGKILL, lambda: list(folder.checkpoints.glob("[0-9]???")))
-    assert len(lines(folder)) < 6, "the kill came too late to show anything"
+    assert len(lines(folder)) < 4, "the kill came too late to show anything"
 
     saved = max(saved_steps(folder.checkpoints))
     before = len(list(folder.tensorboard.iterdir()))
@@ -117,16 +117,16 @@ def test_a_run_that_is_killed_again_and_again_equals_an_undisturbed_one(
     output = at_work.interrupt(signal.SIGINT, begun, code=130)
     assert f"continue with --resume {folder.path}" in output
     so_far = load_policy(folder.policy).manifest["training"]["env_steps"]
-    assert saved <= so_far <= 6144
+    assert saved <= so_far <= 4096
     assert f"resuming at {saved:,} decisions" in output
 
-    resume().interrupt(signal.SIGKILL, (folder.checkpoints / "6144").is_dir)
+    resume().interrupt(signal.SIGKILL, (folder.checkpoints / "4096").is_dir)
     assert not folder.evaluation.exists()
 
     output = resume().end(0)
-    assert "resuming at 6,144 decisions" in output
+    assert "resuming at 4,096 decisions" in output
     assert load_policy(folder.policy).fingerprint == load_policy(run.policy).fingerprint
-    assert [x["env_steps"] for x in lines(folder)] == list(range(1024, 6145, 1024))
+    assert [x["env_steps"] for x in lines(folder)] == list(range(1024, 4097, 1024))
     assert held_out(folder) == held_out(run)
     assert validated(folder) == validated(run)
     evaluations = [json.loads(x.evaluation.read_text()) for x in (run, folder)]
