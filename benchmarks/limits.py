@@ -4,6 +4,7 @@ Tables, one per call (`--table`):
   ramp    `rate-oracle` and `pd-attitude` while the legs move for other shares of a decision;
   push    policy and baselines in every scenario of suite `push`, with its pushes and without. A
           push is overcome once the tilt stays within `SETTLED` of its twin's until the next push;
+  decks   policy and `pd-imu` on decks at sea, from calm to faster than the legs can follow;
   gains   the PD baselines' gains, tuned on training seeds of `--suite` by coordinate search: each
           in turn is set to the best of a few values until a round changes nothing. Those of suite
           `paper` are the defaults in `mjx_balance/evaluation/controllers.py`.
@@ -20,6 +21,7 @@ import numpy as np
 from common import DURATION, POLICY, Row
 
 from mjx_balance.config import TaskConfig, preset
+from mjx_balance.config.sea import RATE
 from mjx_balance.evaluation.controllers import AttitudePD, Controller, ImuPD, make_controller
 from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS, SUITES, draw_suite
@@ -29,6 +31,11 @@ from mjx_balance.sim.scene import Scene, load_scene
 RAMPS = (0.02, 0.1, 0.2, 0.4, 0.6)
 RAMPED = ("rate-oracle", "pd-attitude")
 PUSHED = ("pd-imu", "pd-attitude", "rate-oracle", "clairvoyant")
+SEAS = (
+    *((2.0, 10.0, 0.0), (4.3, 10.0, 0.0), (7.0, 10.0, 0.0), (7.0, 7.0, 0.0), (10.0, 7.0, 0.0)),
+    *((4.3, 10.0, 0.25), (4.3, 10.0, 1.0), (4.3, 10.0, 3.0), (7.0, 7.0, 2.0)),
+)
+"""Significant angles, deg, peak periods, s, and significant heights, m."""
 SETTLED = 0.2
 """Tilt that is no consequence of a push any more, deg."""
 GRIDS: dict[type, dict[str, tuple[float, ...]]] = {
@@ -116,6 +123,34 @@ def push(args: argparse.Namespace) -> None:
     common.report(args, "limits push", rows, note, forms)
 
 
+def decks(args: argparse.Namespace) -> None:
+    """Table `decks`."""
+    policy, default = load_policy(args.policy), load_scene(preset("default"))
+    acting = {
+        args.policy.name: (policy_scene(policy), observing(policy)),
+        "pd-imu": (default, make_controller("pd-imu", default)),
+    }
+    rows = []
+    for angle, period, height in SEAS:
+        row: Row = {"significant angle": angle, "peak period": period, "heave": height}
+        for name, (scene, controller) in acting.items():
+            task = dataclasses.replace(
+                scene.task,
+                max_incline=max(angle, scene.task.max_incline),
+                board_rate=max(RATE * angle / period, scene.task.board_rate) + 1e-6,
+                sea_angle=angle,
+                sea_period=period,
+                sea_height=height,
+            )
+            at_sea = dataclasses.replace(scene, task=task)
+            suite = "platform" if height else "sea"
+            row[name] = common.pooled([common.evaluated(at_sea, controller, suite, args.scenarios)])
+        rows.append(row)
+    note = f"{args.scenarios} held-out scenarios of {DURATION:g} s; {common.TILTS}."
+    forms = {"significant angle": "{:g} deg", "peak period": "{:g} s", "heave": "{:g} m"}
+    common.report(args, "limits decks", rows, note, forms)
+
+
 def gains_row(kind: type, suite: str, scenarios: int) -> Row:
     """The search for one baseline's gains."""
     scene = load_scene(preset("default"))
@@ -155,13 +190,13 @@ def gains(args: argparse.Namespace) -> None:
     common.report(args, "limits gains", rows, note, forms)
 
 
-TABLES = {x.__name__: x for x in (ramp, push, gains)}
+TABLES = {x.__name__: x for x in (ramp, push, decks, gains)}
 
 
 def main() -> None:
     """Measures one table."""
     parser = common.arguments(__doc__, TABLES)
-    parser.add_argument("--policy", type=Path, default=POLICY, help="of table push")
+    parser.add_argument("--policy", type=Path, default=POLICY, help="of tables push and decks")
     parser.add_argument("--suite", choices=SUITES, default="paper", help="of table gains")
     parser.add_argument("--scenarios", type=int, default=16)
     args = parser.parse_args()

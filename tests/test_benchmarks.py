@@ -40,6 +40,7 @@ SMALLEST = {
     "fidelity.py --table precision --scenarios 1 --seeds 0 --decisions 2048": "| bfloat16 | 256 |",
     "limits.py --scenarios 1": "| 10% (as shipped) |",
     "limits.py --table push --scenarios 1": "| clairvoyant |",
+    "limits.py --table decks --scenarios 1": "| 10 deg | 7 s | 0 m |",
     "limits.py --table gains --scenarios 1": "| ImuPD | tau ",
     "ablation.py --only 0 --decisions 2560 --scenarios 1 --runs {work}": "| as it is | 1 |",
     "robots.py --robots go1 --scenarios 4": "| go1 | 12.7 kg |",

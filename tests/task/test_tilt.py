@@ -258,11 +258,18 @@ def test_a_platform_moves_as_the_surface_of_the_sea() -> None:
     )
     time = np.arange(12.0, 30.0, 0.01)
     x, y = np.radians(board_angle(task, raft, time)).T
-    acceleration = np.diff(platform_position(task, raft, time), 2, axis=0) / 0.01**2
+    position = platform_position(task, raft, time)
+    acceleration = np.diff(position, 2, axis=0) / 0.01**2
     felt = acceleration + np.asarray([0, 0, 9.81])
     np.testing.assert_allclose(felt[:, 0] / felt[:, 2], y[1:-1], atol=1e-3)
     np.testing.assert_allclose(felt[:, 1] / felt[:, 2], -x[1:-1], atol=1e-3)
     assert np.ptp(felt[:, 1] / felt[:, 2]) > 5e-3
+    # A wave keeps its shape as it runs: heave rate = -speed * slope, with speed g / w.
+    along = one.amplitude[0, 2:4] / height[3]
+    rising = np.stack((-y, x), axis=-1) @ along
+    heave_rate = np.gradient(position[:, 2], time)[1:-1]
+    np.testing.assert_allclose(heave_rate, -9.81 / one.omega[0] * rising[1:-1], atol=1e-3)
+    assert np.ptp(heave_rate) > 0.02
 
 
 def test_no_platform_falls_faster_than_the_bound() -> None:
