@@ -101,7 +101,8 @@ def env_courses(
     """The courses in the training env, closed and open loop, for each case and its actions."""
     # Whatever it is, randomisation makes the env take domain parameters, which are then given.
     randomization = RandomizationConfig(payload=1.0)
-    env = BalanceEnv(dataclasses.replace(policy.config, engine=engine, randomization=randomization))
+    config = dataclasses.replace(policy.config, engine=engine, randomization=randomization)
+    env = BalanceEnv(config, "discrete")
     count, sim_steps = len(cases[0][0].scenario.phase), env.config.task.sim_steps
     first = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), count))
     step = jax.jit(jax.vmap(env.step))

@@ -84,8 +84,8 @@ class TaskConfig:
     action_levels: Annotated[int, Ge(3), Le(201)] = 21
     """Height changes per axis (paper Eq. 3: n = 0..20)."""
     action: Literal["grid", "continuous"] = "grid"
-    """What policies and baselines command: the grid's height changes (paper Eq. 3), or any up to
-    action_max, for which a policy needs the head "radial"."""
+    """What policies and baselines command, and training explores: the grid's height changes (paper
+    Eq. 3), or any up to action_max, for which a policy needs the head "radial"."""
     action_ramp: Annotated[float, Gt(0), Le(1)] = 0.1
     """Share of a decision in which the legs move to their new heights (chosen: the legs are at
     rest before the next decision, and the gyro reads the board's rate; benchmarks/README.md)."""
@@ -213,8 +213,8 @@ class DQNConfig:
     epsilon_decay_steps: Count = 50_000
     """Env steps over which epsilon falls linearly (chosen)."""
     exploration_noise: CountFrom0 = 0
-    """Greatest number of levels by which a training action moves at random on each axis (chosen:
-    0)."""
+    """Greatest number of levels by which a training action moves at random on each axis; off the
+    grid the move is Gaussian, with the same standard deviation (chosen: 0)."""
     hidden_sizes: Annotated[tuple[Annotated[int, Ge(1), Le(65_536)], ...], Len(1, 64)] = (256, 256)
     """Widths of the Q-network's hidden layers (chosen)."""
     head: Literal["joint", "factored", "radial"] = "joint"

@@ -64,6 +64,8 @@ class DQNSpec:
     symmetries: Symmetries | None = None  #: reflections of the env, for `config.mirror`
     action_factors: tuple[int, ...] | None = None
     """Levels of each digit of an action index, for the exploration noise; None: one digit."""
+    continuous: bool = False
+    """Whether an action is a point of the radial head, a number per factor, instead of an index."""
     first_reset: Callable[[jax.Array], State] | None = None
     """PRNG key -> an env at the start of a run; None: `Env.reset`."""
     sweep: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
@@ -77,6 +79,8 @@ class DQNSpec:
                 )
         if self.config.mirror and self.symmetries is None:
             raise ValueError("mirror is True, but no symmetries are given to mirror with")
+        if self.continuous and (self.config.head != "radial" or self.action_factors is None):
+            raise ValueError("continuous is True; it needs the head 'radial' and action_factors")
         for name, values in self.sweep.items():
             if len(values) != self.num_seeds or self.num_seeds == 1:
                 raise ValueError(f"{name} has {len(values)} values for {self.num_seeds} runs")
@@ -125,8 +129,8 @@ class DQN:
     """Trains a Q-network on a brax env.
 
     Args:
-      env: unbatched, with `action_size` discrete actions; `info["truncation"]`, if there,
-        marks time-outs.
+      env: unbatched, with `action_size` discrete actions, or with `spec.continuous` as many
+        numbers from -1 to 1; `info["truncation"]`, if there, marks time-outs.
       network: maps (..., obs_size) to (..., action_size).
       spec: the numbers of the run.
     """
@@ -216,7 +220,8 @@ class DQN:
         params = self.network.init(key_params, obs)
         statistics = normalization.init(len(obs), config.whiten_floor)
         scalar = jnp.float32(0.0)
-        example = Transition(obs, jnp.int32(0), scalar, scalar, obs)
+        action = jnp.zeros(len(spec.action_factors or ())) if spec.continuous else jnp.int32(0)
+        example = Transition(obs, action, scalar, scalar, obs)
         return TrainState(
             params=params,
             target_params=jax.tree.map(jnp.copy, self.fold(params, statistics)),
@@ -270,12 +275,15 @@ class DQN:
 
     def act(
         self, params: Params, obs: Float[Array, " obs"], key: PRNGKeyArray, epsilon: jax.Array
-    ) -> Int[Array, ""]:
+    ) -> Int[Array, ""] | Float[Array, " axes"]:
         """The action of one env: epsilon-greedy, then exploration noise."""
         factors = self.spec.action_factors or (self.env.action_size,)
         levels = self.spec.config.exploration_noise
         greedy = self.head(params, obs).argmax()
         key, key_noise = jax.random.split(key)
+        if self.spec.continuous:
+            action = epsilon_greedy_point(key, greedy, epsilon)
+            return gaussian_noise(key_noise, action, factors, levels) if levels else action
         action = epsilon_greedy(key, greedy, epsilon, math.prod(factors))
         return exploration_noise(key_noise, action, factors, levels) if levels else action
 
@@ -378,7 +386,7 @@ class DQN:
     def head(self, params: Params, obs: Float[Array, "*batch obs"]) -> Head:
         """The network's head for raw observations."""
         head: Any = self.network.apply(params, obs, method="head")
-        return head
+        return head.off_grid() if self.spec.continuous else head
 
     def fold(self, params: Params, statistics: RunningStatistics) -> Params:
         """Folds the whitening into the parameters, which is cheaper than whitening every input."""
@@ -389,7 +397,7 @@ class DQN:
 
 def td_error(
     q_tm1: Head,
-    a_tm1: Int[Array, ""],
+    a_tm1: Int[Array, ""] | Float[Array, " axes"],
     r_t: Float[Array, ""],
     discount_t: Float[Array, ""],
     q_t: Head,
@@ -402,13 +410,14 @@ def td_error(
 
     Args:
       q_tm1: action values of the online network at t - 1.
-      a_tm1: action index at t - 1.
+      a_tm1: action at t - 1, an index or a point.
       r_t: reward at t.
       discount_t: gamma, or 0 after a termination.
       q_t: action values of the target network at t.
       q_t_selector: action values that select the action at t.
     """
-    return r_t + discount_t * q_t.q_value(q_t_selector.argmax()) - q_tm1.q_value(a_tm1)
+    a_t = jax.lax.stop_gradient(q_t_selector.argmax())  # a point has a gradient
+    return r_t + discount_t * q_t.q_value(a_t) - q_tm1.q_value(a_tm1)
 
 
 def make_optimizer(config: DQNConfig, gradient_steps: int) -> optax.GradientTransformation:
@@ -458,8 +467,36 @@ def exploration_noise(
     return jnp.ravel_multi_index(tuple(digits), tuple(factors), mode="clip").astype(action.dtype)
 
 
+def epsilon_greedy_point(
+    key: PRNGKeyArray, greedy: Float[Array, " axes"], epsilon: jax.Array
+) -> Float[Array, " axes"]:
+    """Returns the point `greedy`, or with probability `epsilon` a uniformly random one, -1 to 1."""
+    key_which, key_random = jax.random.split(key)
+    random = jax.random.uniform(key_random, greedy.shape, greedy.dtype, -1.0, 1.0)
+    return jnp.where(jax.random.bernoulli(key_which, epsilon), random, greedy)
+
+
+def gaussian_noise(
+    key: PRNGKeyArray, point: Float[Array, " axes"], factors: Sequence[int], levels: int
+) -> Float[Array, " axes"]:
+    """Moves a point by Gaussian noise, and clips it to -1 to 1.
+
+    The standard deviation is that of `exploration_noise`, sqrt(levels * (levels + 1) / 3) levels.
+
+    Args:
+      key: PRNG key.
+      point: -1 to 1 on each axis.
+      factors: number of levels of each axis.
+      levels: as of `exploration_noise`.
+    """
+    level = 2 / (jnp.asarray(factors, point.dtype) - 1)
+    scale = math.sqrt(levels * (levels + 1) / 3) * level
+    move = scale * jax.random.normal(key, point.shape, point.dtype)
+    return jnp.clip(point + move, -1.0, 1.0)
+
+
 def step(
-    env: Env, state: State, action: Int[Array, " envs"], key: PRNGKeyArray
+    env: Env, state: State, action: jax.Array, key: PRNGKeyArray
 ) -> tuple[State, Transition, Bool[Array, ""], Means]:
     """Steps this device's envs once and resets those that are done.
 

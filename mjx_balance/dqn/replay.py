@@ -8,11 +8,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 Symmetries: TypeAlias = tuple[
-    Int[np.ndarray, "g obs"], Float[np.ndarray, "g obs"], Int[np.ndarray, "g actions"]
+    Int[np.ndarray, "g obs"],
+    Float[np.ndarray, "g obs"],
+    Int[np.ndarray, "g actions"] | Float[np.ndarray, "g axes"],
 ]
-"""The g reflections of an env, including the identity: `obs_index`, `obs_sign`, `action_index`.
+"""The g reflections of an env, including the identity: `obs_index`, `obs_sign`, `action`.
 
-Reflection k maps obs to obs[obs_index[k]] * obs_sign[k], and action to action_index[k, action].
+Reflection k maps obs to obs[obs_index[k]] * obs_sign[k], an action index to action[k, index], and
+an action that is a point to point * action[k].
 """
 
 
@@ -20,7 +23,8 @@ class Transition(NamedTuple):
     """One step of one env; in the buffer, every field has a leading capacity axis."""
 
     obs: Float[Array, "*rows obs"]
-    action: Int[Array, "*rows"]  #: index, int32
+    action: Int[Array, "*rows"] | Float[Array, "*rows axes"]
+    """Index, int32; or the numbers of a continuous action."""
     reward: Float[Array, "*rows"]
     terminated: Float[Array, "*rows"]
     """1 after a termination; 0 otherwise, also after a truncation, which ends no bootstrapping."""
@@ -84,8 +88,9 @@ def sample(state: ReplayState, key: PRNGKeyArray, batch_size: int) -> Transition
 
 def reflect(batch: Transition, symmetries: Symmetries, key: PRNGKeyArray) -> Transition:
     """Replaces each transition of a batch by one of its reflections, chosen at random."""
-    obs_index, obs_sign, action_index = map(jnp.asarray, symmetries)
-    which = jax.random.randint(key, batch.action.shape, 0, len(obs_index))
+    obs_index, obs_sign, actions = map(jnp.asarray, symmetries)
+    which = jax.random.randint(key, batch.reward.shape, 0, len(obs_index))
+    points = jnp.issubdtype(batch.action.dtype, jnp.floating)
 
     def reflected(obs: jax.Array) -> jax.Array:
         return jnp.take_along_axis(obs, obs_index[which], axis=-1) * obs_sign[which]
@@ -93,5 +98,5 @@ def reflect(batch: Transition, symmetries: Symmetries, key: PRNGKeyArray) -> Tra
     return batch._replace(
         obs=reflected(batch.obs),
         next_obs=reflected(batch.next_obs),
-        action=action_index[which, batch.action],
+        action=batch.action * actions[which] if points else actions[which, batch.action],
     )

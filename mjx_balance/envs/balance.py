@@ -48,14 +48,14 @@ class BalanceEnv(Env):
     }
     """Metrics of `State.metrics` that are logged otherwise than as a mean under their own name."""
 
-    def __init__(self, config: Config | None = None, action: str = "discrete"):
+    def __init__(self, config: Config | None = None, action: str | None = None):
         """Builds the scene.
 
         Args:
           config: the preset "default" if none; `robots.limits.for_robot` makes
             another robot's.
           action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
-            `action_max`, -1 to 1.
+            `action_max`, -1 to 1; None: as `config.task.action`.
 
         Raises:
           ConfigError: if the config cannot be run, or for another kind of action.
@@ -82,8 +82,13 @@ class BalanceEnv(Env):
 
     @property
     def symmetries(self) -> Symmetries:
-        """How observations and discrete actions look in a mirror."""
-        return symmetries(self.config.task, self.scene.robot)
+        """How observations and actions look in a mirror."""
+        return symmetries(self.config.task, self.scene.robot, self.continuous)
+
+    @property
+    def continuous(self) -> bool:
+        """Whether an action is two numbers."""
+        return not self._discrete
 
     @property
     def backend(self) -> str:

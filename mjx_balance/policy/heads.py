@@ -2,7 +2,7 @@
 
 They work on NumPy arrays (the exported policy) and JAX arrays (training). An action index is a
 mixed-radix number with one digit per factor. `q_value` and `argmax` do not compute the values of
-all actions.
+all actions. `RadialPoints` has the same values for actions that are points, on the grid or off it.
 """
 
 import dataclasses
@@ -69,8 +69,13 @@ class Radial:
     def q_value(self, action: Any) -> Any:
         """Values (...) of action indices (...)."""
         xp = self.out.__array_namespace__()
+        return self.value_at(xp.asarray(points(self.factors))[action])
+
+    def value_at(self, point: Any) -> Any:
+        """Values (...) of points x(a), (..., len(factors))."""
+        xp = self.out.__array_namespace__()
         alpha, beta, kappa, delta = xp.logaddexp(self.profile, xp.zeros_like(self.profile))
-        away = xp.asarray(points(self.factors))[action] - self.out[..., 1:]
+        away = point - self.out[..., 1:]
         z = xp.sqrt(delta**2 + xp.sum((away * xp.exp(self.stretch)) ** 2, axis=-1))
         return self.out[..., 0] + alpha * xp.exp(-beta * z) - kappa * z
 
@@ -89,6 +94,26 @@ class Radial:
         """
         xp = self.out.__array_namespace__()
         return xp.clip(xp.nan_to_num(self.out[..., 1:], nan=-1.0), -1, 1)
+
+    def off_grid(self) -> "RadialPoints":
+        """The same head for actions that are points."""
+        return RadialPoints(self.out, self.profile, self.stretch, self.factors)
+
+
+class RadialPoints(Radial):
+    """A radial head whose actions are points (..., len(factors)), -1 to 1, instead of indices.
+
+    The value falls with the distance on every axis, so of all points in the square the nearest to
+    mu is the best.
+    """
+
+    def q_value(self, action: Any) -> Any:
+        """Values (...) of points (..., len(factors))."""
+        return self.value_at(action)
+
+    def argmax(self) -> Any:
+        """The best points (..., len(factors))."""
+        return self.peak()
 
 
 Head = Additive | Radial

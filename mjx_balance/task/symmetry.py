@@ -15,10 +15,11 @@ class Symmetries(NamedTuple):
 
     obs_index: Int32[np.ndarray, "reflections obs_size"]  #: entry that takes each place
     obs_sign: Float32[np.ndarray, "reflections obs_size"]  #: its sign there
-    action_index: Int32[np.ndarray, "reflections actions"]  #: index that each action becomes
+    action: Int32[np.ndarray, "reflections actions"] | Float32[np.ndarray, "reflections 2"]
+    """Index that each action becomes, or signs of the two numbers of a continuous action."""
 
 
-def symmetries(task: TaskConfig, robot: Robot) -> Symmetries:
+def symmetries(task: TaskConfig, robot: Robot, continuous: bool = False) -> Symmetries:
     """The left-right mirror of the observation's rows and the actions; a_x changes its sign.
 
     Front-hind is no symmetry of the robot: all its knees bend backward.
@@ -28,8 +29,9 @@ def symmetries(task: TaskConfig, robot: Robot) -> Symmetries:
     mirrored = [place[row.mirror.row] for row in rows]
     signs = [row.mirror.sign for row in rows]
     actions = np.arange(task.num_actions).reshape(task.action_levels, task.action_levels)
+    index = np.asarray((actions.ravel(), actions[::-1].ravel()), np.int32)
     return Symmetries(
         np.asarray((range(len(rows)), mirrored), np.int32),
         np.asarray(([1] * len(rows), signs), np.float32),
-        np.asarray((actions.ravel(), actions[::-1].ravel()), np.int32),
+        np.asarray(((1, 1), (-1, 1)), np.float32) if continuous else index,
     )

@@ -169,6 +169,7 @@ def make_learner(config: Config, env: BalanceEnv) -> DQN:
         num_seeds=len(runs),
         symmetries=env.symmetries,
         action_factors=env.action_factors,
+        continuous=env.continuous,
         first_reset=env.reset_staggered,
         sweep={name: [getattr(run.dqn, name) for run in runs] for name in sweep_grid(config)[0]},
     )

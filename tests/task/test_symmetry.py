@@ -49,9 +49,9 @@ def test_the_identity_and_one_mirror_that_is_its_own_inverse(
     assert group.obs_index.shape == group.obs_sign.shape == (2, size)
     np.testing.assert_array_equal(group.obs_index[0], range(size))
     np.testing.assert_array_equal(group.obs_sign[0], 1)
-    np.testing.assert_array_equal(group.action_index[0], actions)
+    np.testing.assert_array_equal(group.action[0], actions)
     np.testing.assert_array_equal(reflect(group, reflect(group, obs)), obs)
-    np.testing.assert_array_equal(group.action_index[1][group.action_index[1]], actions)
+    np.testing.assert_array_equal(group.action[1][group.action[1]], actions)
 
 
 def test_left_right_by_name(any_config: Config, robot: Robot) -> None:
@@ -65,7 +65,7 @@ def test_left_right_by_name(any_config: Config, robot: Robot) -> None:
         assert names[group.obs_index[1][k]] == expected
         assert group.obs_sign[1][k] == (-1 if name.startswith(("V_x", "Acc_y")) else 1), name
     table = 1000 * action_table(any_config.task)
-    np.testing.assert_allclose(table[group.action_index[1]], table * (-1, 1), atol=1e-6)
+    np.testing.assert_allclose(table[group.action[1]], table * (-1, 1), atol=1e-6)
 
 
 def test_legs_in_another_order_have_the_same_partners(any_config: Config, robot: Robot) -> None:
@@ -106,7 +106,7 @@ def test_the_robot_on_a_mirrored_board_sees_the_mirrored_world(
 
     seen, rollout = run(drawn, actions, 1.0)
     mirrored = drawn._replace(targets=drawn.targets * (-1, 1))
-    reflected, other = run(mirrored, group.action_index[1][actions], -1.0)
+    reflected, other = run(mirrored, group.action[1][actions], -1.0)
     assert np.abs(seen[-1]).max() > 1, "something moved"
     np.testing.assert_allclose(reflected, reflect(group, seen), atol=1e-9)
     np.testing.assert_allclose(other.tilt, rollout.tilt, atol=1e-9)
