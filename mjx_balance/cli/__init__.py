@@ -1,11 +1,12 @@
 """The command line, `mjx-balance`: one module per command, imported when it runs."""
 
+import errno
 import importlib
 import io
 import sys
 from collections.abc import Sequence
 
-from mjx_balance.errors import INTERRUPTED, USAGE_ERROR, InputError
+from mjx_balance.errors import FAILED, INTERRUPTED, USAGE_ERROR, InputError
 
 COMMANDS = {
     "train": "train:train",
@@ -17,6 +18,7 @@ COMMANDS = {
     "robot": "robot:robot",
 }
 """Command -> `module:function` of this package; functions return an exit code."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  #: no fault of the input
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         return complain(str(error))
     except OSError as error:
-        return complain(f"cannot write {error.filename or 'all of it'}: {error.strerror}")
+        message = f"cannot write {error.filename or 'all of it'}: {error.strerror}"
+        return complain(message, FAILED if error.errno in NO_ROOM else USAGE_ERROR)
     except KeyboardInterrupt:
         return INTERRUPTED
