@@ -232,6 +232,32 @@ def test_a_byte_a_second_is_no_hello(
     assert seconds < 1.2
 
 
+def test_the_oldest_strangers_make_room(
+    address: Address, opened: list[socket.socket], monkeypatch: pytest.MonkeyPatch, come: Any
+) -> None:
+    """Of seven idle ones only the newest three stay, long before their time is over."""
+    monkeypatch.setattr(meeting, "CALLERS", 3)
+    monkeypatch.setattr(meeting, "HELLO_S", 60)
+
+    def dropped(caller: socket.socket) -> bool:
+        caller.settimeout(0.2)
+        with contextlib.suppress(TimeoutError):
+            while caller.recv(1000):
+                pass
+            return True
+        return False
+
+    def second() -> Any:
+        strangers = [knock(address) for _ in range(7)]
+        opened.extend(strangers)
+        wait_for(lambda: dropped(strangers[3]))
+        states = [dropped(stranger) for stranger in strangers]
+        come(1, 2)
+        return states
+
+    assert at_once(lambda: come(0, 2), second)[1] == [True] * 4 + [False] * 3
+
+
 def test_a_process_that_was_killed_may_come_again(address: Address, come: Any) -> None:
     """As long as another one is awaited; nobody waits for the one that is gone."""
 
