@@ -1,8 +1,10 @@
 """Does memory stay flat?
 
 Trains for some minutes, then gives a controller millions of samples, each in a process of its own,
-and compares the resident memory after a tenth of the time with that at the end. The controller's
-samples are those of a standing robot; one in 10,000 is impossible, and the controller is reset.
+and compares the memory after a tenth of the time with that at the end. Pages of files do not count:
+the kernel takes them back when it likes. Training counts from its second checkpoint on, when each
+part of the loop has run. The controller's samples are those of a standing robot; one in 10,000 is
+impossible, and the controller is reset.
 
     python benchmarks/soak.py [--minutes 10] [--samples 10000000] [--write benchmarks/README.md]
 """
@@ -26,13 +28,14 @@ READINGS = 1_000
 """How often memory is read in all."""
 
 
-def resident(process: int | None = None) -> float:
-    """Memory of a process, or of this one, MiB."""
-    return psutil.Process(process).memory_info().rss / 2**20
+def memory(process: int | None = None) -> float:
+    """Resident memory of a process, or of this one, without pages of files, MiB."""
+    info = psutil.Process(process).memory_info()
+    return (info.rss - info.shared) / 2**20
 
 
 def train(engine: str, minutes: float) -> list[float]:
-    """Memory of a training run, MiB, from its first logged decisions on.
+    """Memory of a training run, MiB, from its second checkpoint on.
 
     Raises:
       RuntimeError: if it ends early.
@@ -43,15 +46,15 @@ def train(engine: str, minutes: float) -> list[float]:
         flags = f"--engine {engine} --num-env-steps 1000000000 --run-dir {run}".split()
         command = [sys.executable, str(common.REPO / "train.py"), *flags]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-            metrics, began = run / "metrics.jsonl", 0.0
+            began = 0.0
             while not began or time.monotonic() - began < 60 * minutes:
                 time.sleep(60 * minutes / READINGS)
                 if process.poll() is not None:
                     raise RuntimeError(f"training ended with exit status {process.returncode}")
-                if not began and metrics.is_file() and metrics.stat().st_size:
+                if not began and len([*run.glob("checkpoints/*")]) > 1:
                     began = time.monotonic()
                 if began:
-                    readings.append(resident(process.pid))
+                    readings.append(memory(process.pid))
             process.kill()
     return readings
 
@@ -79,7 +82,7 @@ def control(policy: Path, samples: int) -> list[float]:
         if faulty:
             controller.reset()
         if k % max(1, samples // READINGS) == 0:
-            readings.append(resident())
+            readings.append(memory())
     return readings
 
 
@@ -106,7 +109,7 @@ def main() -> None:
         row(f"`Controller`, {args.samples:,} samples", controller),
     ]
     forms = {"after a tenth": "{:.1f}", "at the end": "{:.1f}", "growth": "{:+.2%}"}
-    note = f"Resident memory, MiB; {common.machine()}."
+    note = f"Memory without pages of files, MiB; {common.machine()}."
     common.report(args, "soak", rows, note, forms)
 
 

@@ -73,7 +73,7 @@ def test_tests_of_a_module_import_it_the_nearest_first() -> None:
     first, *others = selection.tests_of("mjx_balance.task.tilt")
     further = [file for group in others for file in group]
     assert first[0] == "tests/task/test_tilt.py"
-    assert "tests/envs/test_env.py" in further, "through the fixture `fleet`"
+    assert "tests/training/test_stagger.py" in further, "through the fixture `fleet`"
     assert len({*first, *further}) == len(first) + len(further)
 
 
