@@ -14,8 +14,9 @@ from mjx_balance.errors import InputError
 from mjx_balance.files.validation import STRICT
 
 ACTION_AXES = 2  # roll and pitch, paper Eq. 3
+GRAVITY = 9.81  # m/s^2
 DEGREE = math.radians(1.0)  # rad
-LEAN = 9.81 * math.sin(DEGREE)  # m/s^2, accelerometer x or y at a tilt of 1 deg
+LEAN = GRAVITY * math.sin(DEGREE)  # m/s^2, accelerometer x or y at a tilt of 1 deg
 
 HUGE = 1e300
 """Bound of all numbers; it keeps sums of them finite."""

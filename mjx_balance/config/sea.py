@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from mjx_balance.config.schema import ConfigError, TaskConfig
+from mjx_balance.config.schema import GRAVITY, ConfigError, TaskConfig
 
 WAVES = 8
 """Waves of a sea, of equal energy. The sum of so many amplitudes, sqrt(2 * WAVES) / 4 of the
 significant height, is the height itself."""
 HIGHEST = 2.0  #: greatest frequency, in peak frequencies
-GRAVITY = 9.81  #: m/s^2
 TOP = math.exp(-1.25 / HIGHEST**4)  #: share of the spectrum's energy below it
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
+from mjx_balance.config.schema import GRAVITY
 from mjx_balance.files.validation import check_types
 from mjx_balance.robots.model import JOINT_ACTUATORS
 from mjx_balance.robots.robot import OUR_LEVER, OUR_MASS, Body, Leg, Robot
@@ -24,7 +25,6 @@ OUR_LEG, OUR_HALF_TRACK, OUR_HEIGHT = 0.426, 0.142, 0.35
 OUR_STIFFNESS, OUR_DAMPING, OUR_ARMATURE = 400.0, 16.0, 0.02
 OUR_ACTION = 0.003  # paper Eq. 3
 STRETCH = 0.77  #: standing length of the legs, of their full length: 0.35 m for ours (paper 3.1)
-GRAVITY = 9.81  #: m/s^2
 LEAST_STIFFNESS = 2.0
 """Least stiffness of the servos, relative to weight times leg; that of ours is 6.3. Below 1.2 a
 small robot tilts by half a degree on the tilted board."""
