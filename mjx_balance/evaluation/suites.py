@@ -124,7 +124,7 @@ def draw_suite(
     ranges = scale_ranges(chosen.randomization, robot)
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     if chosen.motion is not None:
-        draw = tilt.MOTIONS[chosen.motion].draw
+        draw = tilt.MOTIONS[chosen.motion]
         still = task if chosen.platform else dataclasses.replace(task, sea_height=0.0)
         check_platform(still)
         own = [np.random.default_rng((seed, k, 3)) for k in range(scenarios)]

@@ -137,7 +137,7 @@ def draw_scenario(task: TaskConfig, uniform: Uniform) -> Scenario:
         the calls always come in the same order.
     """
     count = num_targets(task, task.episode_length * task.ctrl_dt)
-    drawn = [MOTIONS[name].draw(task, count, uniform) for name in task.board_motions]
+    drawn = [MOTIONS[name](task, count, uniform) for name in task.board_motions]
     if len(drawn) == 1:
         return drawn[0]
     number = uniform((), 0.0, float(len(drawn)))
@@ -221,21 +221,11 @@ def _orbit(heading: Float[Array, "*batch"]) -> Float[Array, "*batch 3"]:
     return xp.stack((xp.cos(heading), xp.sin(heading), xp.ones_like(heading)), axis=-1)
 
 
-class BoardMotion(NamedTuple):
-    """A kind of board motion."""
-
-    name: str  #: as in `TaskConfig.board_motions`
-    draw: Callable[[TaskConfig, int, Uniform], Scenario]
-    """(task, number of targets, uniform) -> one scenario; `uniform` as of `draw_scenario`."""
-
-
-MOTIONS = {
-    row.name: row
-    for row in (
-        BoardMotion("ramps", _draw_ramps),
-        BoardMotion("steps", _draw_steps),
-        BoardMotion("sea", _draw_sea),
-    )
+MOTIONS: dict[str, Callable[[TaskConfig, int, Uniform], Scenario]] = {
+    "ramps": _draw_ramps,
+    "steps": _draw_steps,
+    "sea": _draw_sea,
 }
-"""The kinds by name. Each is a case of the one closed form of `board_angle`, so that envs of one
-batch may differ in kind. To add one: a row here, and its name in `TaskConfig.board_motions`."""
+"""Name -> function that draws one scenario from task, number of targets, and `uniform` as of
+`draw_scenario`. Each is a case of the one closed form of `board_angle`, so that envs of one batch
+may differ in kind. To add one: a row here, and its name in `TaskConfig.board_motions`."""

@@ -143,7 +143,7 @@ def test_steps_and_sea_have_generators_of_their_own(config: Config) -> None:
     """So that no draw of another suite changes; a heading of the config holds for all scenarios."""
     for suite in ("steps", "sea"):
         own = np.random.default_rng((4, 1, 3))
-        expected = MOTIONS[suite].draw(config.task, 7, numpy_uniform(own))
+        expected = MOTIONS[suite](config.task, 7, numpy_uniform(own))
         got = rows(draw(config, suite, 2, 60.0, 4).scenario, np.asarray([1]))
         jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y), got, expected)
     waves = draw(with_task(config, sea_heading=90.0), "sea", 200, 60.0, 0).scenario.waves

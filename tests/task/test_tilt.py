@@ -209,7 +209,7 @@ def test_no_sea_exceeds_the_bounds_of_the_config(period: float) -> None:
     assert np.abs(np.diff(angle, axis=1)).max() / 0.05 <= 3.5
     np.testing.assert_array_equal(angle[:, 0], 0)
     assert np.abs(angle[:, 1]).max() < 2e-3, "at rest at first"
-    worst = MOTIONS["sea"].draw(
+    worst = MOTIONS["sea"](
         dataclasses.replace(task, sea_heading=0.0), 2, lambda shape, low, high: np.zeros(shape)
     )
     assert worst.waves is not None
@@ -225,7 +225,7 @@ def test_waves_tilt_the_board_in_the_direction_in_which_they_run() -> None:
     """Rotated by the hinges, X outside, the board's surface has the slope of the wave."""
     task = dataclasses.replace(SEA, sea_heading=70.0)
     zeros = lambda shape, low, high: np.zeros(shape)  # noqa: E731
-    scenario = MOTIONS["sea"].draw(task, 2, zeros)
+    scenario = MOTIONS["sea"](task, 2, zeros)
     x, y = np.radians(board_angle(task, scenario, np.asarray([23.0]))[0])
     normal = np.asarray([np.sin(y), -np.sin(x) * np.cos(y), np.cos(x) * np.cos(y)])
     slope = -normal[:2] / normal[2]
@@ -244,7 +244,7 @@ def test_a_platform_moves_as_the_surface_of_the_sea() -> None:
     With one wave, whose slope is k a = w^2 a / g, at every time.
     """
     task = dataclasses.replace(SEA, sea_heading=-40.0, platform=True)
-    sea = MOTIONS["sea"].draw(task, 2, lambda shape, low, high: np.full(shape, 0.3))
+    sea = MOTIONS["sea"](task, 2, lambda shape, low, high: np.full(shape, 0.3))
     waves = sea.waves
     assert waves is not None
     height = np.linalg.norm(waves.amplitude[:, 2:4], axis=-1)
@@ -278,7 +278,7 @@ def test_no_platform_falls_faster_than_the_bound() -> None:
     highest = GRAVITY * 25 / ACCELERATION
     task = dataclasses.replace(task, sea_height=highest)
     check_platform(task)
-    worst = MOTIONS["sea"].draw(task, 2, lambda shape, low, high: np.zeros(shape))
+    worst = MOTIONS["sea"](task, 2, lambda shape, low, high: np.zeros(shape))
     assert worst.waves is not None
     at = worst.waves.omega[:, None] * 5.0 * np.ones(5)
     crest = worst._replace(waves=worst.waves._replace(phase=np.pi / 2 - at))
