@@ -1,6 +1,9 @@
 """What a container's limits leave of a machine with 8 cores and 16 GiB."""
 
 import os
+import platform
+import subprocess
+import sys
 import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -89,3 +92,32 @@ def test_the_narrowest_of_nested_groups_counts(limit: Limit) -> None:
 def test_more_used_than_allowed_leaves_nothing(limit: Limit) -> None:
     """As after a limit was lowered."""
     assert limit(V2, {"box/memory.max": GIB, "box/memory.current": 2 * GIB}) == (8, 0)
+
+
+COUNT_HEAPS = """
+import ctypes, sys, threading
+from mjx_balance.machine import share_heap
+
+share_heap()
+libc = ctypes.CDLL(None)
+libc.fopen.restype = ctypes.c_void_p
+barrier = threading.Barrier(9)
+
+def allocate():
+    libc.malloc(10_000)
+    barrier.wait()
+
+for _ in range(8):
+    threading.Thread(target=allocate, daemon=True).start()
+barrier.wait()
+file = ctypes.c_void_p(libc.fopen(sys.argv[1].encode(), b"w"))
+libc.malloc_info(0, file)
+libc.fclose(file)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="malloc_info is glibc's")
+def test_threads_share_one_heap(tmp_path: Path) -> None:
+    file = tmp_path / "heaps.xml"
+    subprocess.run([sys.executable, "-c", COUNT_HEAPS, file], check=True)
+    assert file.read_text().count("<heap ") == 1

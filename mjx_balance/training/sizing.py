@@ -15,7 +15,7 @@ from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 from mjx_balance.dqn.mesh import REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import write_json
-from mjx_balance.machine import available_memory, cores
+from mjx_balance.machine import available_memory, cores, share_heap
 from mjx_balance.policy.manifest import network_factors
 from mjx_balance.sim.engines.table import check_platform
 from mjx_balance.text import quote, shorten
@@ -42,6 +42,7 @@ def configure_jax(log_fn: LogFn, num_cores: int | None = None) -> None:
     Raises:
       ConfigError: if JAX has no device, or not all processes have the same number of devices.
     """
+    share_heap()  # before JAX starts threads
     # Too late if JAX is already in use, as in a notebook: its devices do as they are.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", num_cores or cores())
