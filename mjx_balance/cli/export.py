@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -15,12 +15,16 @@ from mjx_balance.text import PATH, shorten
 
 @dataclasses.dataclass(frozen=True)
 class ExportArgs:
-    """Write a policy as an ONNX model (needs the package onnx), or in the current file format."""
+    """Write a policy as an ONNX model (needs the package onnx), or in the current file format;
+    weights stay as they are."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Policy file, run folder, or the name of a shipped policy."""
     out: Path
-    """File to write: NAME.onnx, or NAME.safetensors to convert a policy of an older format."""
+    """File to write: NAME.onnx, or NAME.safetensors in the current format."""
+    action: Literal["grid", "continuous"] | None = None
+    """Command height changes of the grid, or any up to its greatest; none: as the policy was
+    trained."""
 
 
 def export(argv: list[str]) -> int:
@@ -28,17 +32,19 @@ def export(argv: list[str]) -> int:
     writers = {".onnx": _write_onnx, ".safetensors": _write_safetensors}
     if args.out.suffix not in writers:
         return complain(f"out is {args.out}; its name must end in {' or '.join(writers)}")
-    return writers[args.out.suffix](args.policy, args.out)
+    return writers[args.out.suffix](args)
 
 
-def _write_onnx(name: Path, out: Path) -> int:
+def _write_onnx(args: ExportArgs) -> int:
     try:
         from mjx_balance.policy.onnx import OPSET, export_onnx
     except ImportError as error:
         return complain(f"export needs the package onnx ({error}); {how_to_install('onnx')}")
-    policy = load_policy(name)
-    size = export_onnx(policy, out)
-    print(f"{shorten(out, PATH)}: {size / 1000:,.1f} kB, opset {OPSET}")
+    policy = load_policy(args.policy)
+    if args.action is not None:
+        policy = policy.with_action(args.action)
+    size = export_onnx(policy, args.out)
+    print(f"{shorten(args.out, PATH)}: {size / 1000:,.1f} kB, opset {OPSET}")
     print(
         f"observation (N, {policy.observation_size}) float32 -> "
         f"q_values (N, {len(policy.actions)}) float32, action (N,) int64, command (N, 2) float32"
@@ -46,8 +52,8 @@ def _write_onnx(name: Path, out: Path) -> int:
     return 0
 
 
-def _write_safetensors(name: Path, out: Path) -> int:
-    policy = convert_policy(find_policy(name), out)
-    size, file = out.stat().st_size, shorten(out, PATH)
+def _write_safetensors(args: ExportArgs) -> int:
+    policy = convert_policy(find_policy(args.policy), args.out, args.action)
+    size, file = args.out.stat().st_size, shorten(args.out, PATH)
     print(f"{file}: {size / 1000:,.1f} kB, format {FORMAT_VERSION}, weights {policy.fingerprint}")
     return 0

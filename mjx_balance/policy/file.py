@@ -50,20 +50,24 @@ def save_policy(
     return policy
 
 
-def convert_policy(path: Path, out: Path) -> Policy:
+def convert_policy(path: Path, out: Path, action: str | None = None) -> Policy:
     """Writes a policy file of format 4 or 5 in format 5, atomically, with the same weights.
 
     Args:
       path: file to read.
       out: file to write; may be the same.
+      action: `config.task.action` of the new file; None: as before.
 
     Raises:
-      PolicyError: if `path` is not a policy of these formats.
+      PolicyError: if `path` is not a policy of these formats, or its head allows no such action.
       OSError: if `out` cannot be written; an old file then stays.
     """
     manifest, weights = read_policy(path)
     with naming(path):
-        return save_policy(out, weights, upgrade(manifest))
+        manifest = upgrade(manifest)
+        if action is not None:
+            manifest = Policy(manifest, weights).with_action(action).manifest
+        return save_policy(out, weights, manifest)
 
 
 def shipped_policies() -> dict[str, Path]:

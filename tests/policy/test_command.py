@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from fixtures.policies import HEADS, random_policy, rewrite, with_head
 
+from mjx_balance.cli import main
 from mjx_balance.config import Config, ConfigError, preset
 from mjx_balance.envs.batch import Episodes
 from mjx_balance.envs.gym import BalanceGymEnv
@@ -73,6 +74,28 @@ def test_on_the_grid_every_head_commands_its_action(
     if head != "radial":
         with pytest.raises(ConfigError, match=f"action is 'continuous', but head is '{head}'"):
             policy.with_action("continuous")
+
+
+def test_export_changes_what_a_policy_commands(
+    tmp_path: Path, config: Config, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And nothing else; the runtime of the robot follows the new file."""
+    old, new = tmp_path / "old.safetensors", str(tmp_path / "new.safetensors")
+    policy = random_policy(old, with_head(config, "radial"))
+    obs = np.random.default_rng(0).normal(size=(8, 34))
+    export = ["export", str(old), "--out", new, "--action"]
+    assert main([*export, "continuous"]) == 0
+    assert load_policy(new).fingerprint == policy.fingerprint
+    off_grid = load_policy(new).command(obs)
+    np.testing.assert_array_equal(off_grid, policy.with_action("continuous").command(obs))
+    assert (off_grid != policy.command(obs)).any()
+    assert Controller(new).manifest["action"] == "continuous"
+    assert main([*export, "grid"]) == 0
+    np.testing.assert_array_equal(load_policy(new).command(obs), policy.command(obs))
+    random_policy(old, with_head(config, "joint"))
+    assert main([*export, "continuous"]) == 2
+    assert "action is 'continuous', but head is 'joint'" in capsys.readouterr().err
+    assert load_policy(new).config.dqn.head == "radial"
 
 
 def test_a_file_that_does_not_say_is_of_the_grid(tmp_path: Path, config: Config) -> None:
