@@ -15,8 +15,7 @@ from mjx_balance.text import PATH, shorten
 
 @dataclasses.dataclass(frozen=True)
 class ExportArgs:
-    """Write a policy as an ONNX model (needs the package onnx), or in the current file format;
-    weights stay as they are."""
+    """Write the same weights as an ONNX model (needs the package onnx), or in today's format."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Policy file, run folder, or the name of a shipped policy."""
