@@ -109,11 +109,12 @@ def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
     robot, task, name = scene.robot, scene.task, shorten(scene.robot.name)
     low, high = robot.height_range
     able, reach = authority(task, robot), greatest_incline(task, robot)
+    late = f"; obey after {1000 * robot.command_delay:g} ms" if robot.command_delay else ""
     return [
         f"{name}: {robot.total_mass:.2f} kg, of which the trunk {robot.trunk_mass:.2f}",
         f"stands at {_mm(task.body_height)}; its legs reach from {_mm(low)} to {_mm(high)}",
         f"servos {robot.servo_stiffness:g} N m/rad, {robot.servo_damping:g} N m s/rad; limits "
-        f"{_limit(robot.hip_torque)} (abduction, hip), {_limit(robot.knee_torque)} (knee)",
+        f"{_limit(robot.hip_torque)} (abduction, hip), {_limit(robot.knee_torque)} (knee){late}",
         "",
         *map(_leg, robot.legs),
         *(f"note: {shorten(note, MESSAGE)}" for note in robot_notes(scene.robot_source)),

@@ -106,7 +106,8 @@ def read_manifest(manifest: Any) -> tuple[Config, Robot]:
             remedy = REMEDY if value == CONVERTIBLE else ""
             raise PolicyError(f"{name} is {quote(value)}; this release reads {expected!r}{remedy}")
     config, robot = _config_and_robot(manifest)
-    given = {"action": "grid"} | manifest  # the only kind of the first files of format 5
+    # The first files of format 5 do not say what kind of action they have, nor a command delay.
+    given = {"action": "grid"} | manifest | {"robot": to_dict(robot)}
     for part, expected in describe(config, robot).items():
         if given.get(part) != expected:
             raise PolicyError(f"its {part} is not what its own config gives")

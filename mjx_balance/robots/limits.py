@@ -48,6 +48,11 @@ def authority(task: TaskConfig, robot: Robot) -> float:
     return math.degrees(task.action_max / task.ctrl_dt / robot.lever)
 
 
+def delay_steps(task: TaskConfig, robot: Robot) -> int:
+    """Physics steps until the robot's servos obey a command."""
+    return round(robot.command_delay / task.sim_dt)
+
+
 def check_body(body: Body) -> None:
     """Checks a body that was measured elsewhere.
 
@@ -85,6 +90,13 @@ def check_robot(config: Config, robot: Robot) -> Config:
         raise ConfigError(
             f"max_incline is {task.max_incline} deg; on both axes at once the legs of robot "
             f"{robot.name}, from body_height {task.body_height} m, reach at most {limit:.1f} deg"
+        )
+    rest = task.sim_steps - task.ramp_steps
+    if delay_steps(task, robot) > rest:
+        raise ConfigError(
+            f"command_delay of robot {robot.name} is {robot.command_delay} s; for the legs to "
+            f"arrive before the next decision it must be at most {rest * task.sim_dt:g}: ctrl_dt, "
+            f"{task.ctrl_dt} s, less action_ramp's share of it"
         )
     own = robot.foot_friction
     if ranges.friction_min is None and (ranges.friction_max or own) < own:

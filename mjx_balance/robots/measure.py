@@ -92,6 +92,7 @@ def measure(
         foot_friction=file.foot_friction,
         body_height=height,
         action_max=file.action_max or _three_digits(OUR_ACTION * body.lever / OUR_LEVER),
+        command_delay=file.command_delay,
     )
     # The policy file repeats this check, but only after the training.
     return check_types(robot, RobotError)

@@ -12,6 +12,7 @@ from mjx_balance.files.validation import STRICT
 MOST = 1e7  #: bound of a robot's numbers, in their units
 Number = Annotated[float, Ge(-MOST), Le(MOST)]
 Length = Annotated[float, Gt(0), Le(MOST)]
+Delay = Annotated[float, Ge(0), Le(10)]
 Turn = Annotated[float, Ge(-16), Le(16)]  #: rad; two and a half turns are 15.7
 Bend = Annotated[float, Ge(-math.pi), Le(math.pi)]
 OUR_MASS, OUR_LEVER = 15.2, 0.193  #: mass and lever of our own robot, kg and m
@@ -114,3 +115,4 @@ class Robot(Body):
     foot_friction: Number  #: sliding friction of a foot on the board
     body_height: Number  #: standing height of the trunk's origin, foot radius included, m
     action_max: Number  #: greatest height change of one decision on one axis, m
+    command_delay: Delay = 0.0  #: time until the servos obey a command, s

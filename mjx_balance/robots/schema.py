@@ -10,7 +10,7 @@ from annotated_types import Gt, Le, Len, MinLen
 
 from mjx_balance.config import ConfigError
 from mjx_balance.files.validation import STRICT, parse
-from mjx_balance.robots.robot import MOST, Number
+from mjx_balance.robots.robot import MOST, Delay, Number
 from mjx_balance.text import MESSAGE, printable, quote, shorten
 
 MAX_FILE = 2**20  #: greatest size of a robot file, bytes
@@ -85,6 +85,7 @@ class RobotFile:
     """N m / rad; none, also of the next five: from the robot's mass and size."""
     servo_damping: Positive | None = None  #: N m s / rad
     servo_armature: Positive | None = None  #: inertia of rotor and gear at the joint, kg m^2
+    command_delay: Delay = 0.0  #: time until the servos obey a command, s
     body_height: Positive | None = None  #: standing height of the trunk's origin above the board, m
     action_max: Positive | None = None  #: greatest height change of one decision on one axis, m
     board_size: Positive | None = None  #: length of the board in training, m

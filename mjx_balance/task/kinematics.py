@@ -14,6 +14,8 @@ from mjx_balance.config import TaskConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
+AT_ONCE = np.zeros(())  #: no delay, physics steps
+
 
 def joint_angles(
     robot: Robot, heights: Float[Array, "*batch legs"]
@@ -48,9 +50,19 @@ def foot_heights(
 
 
 def ramp(
-    task: TaskConfig, before: Float[Array, "*batch legs"], after: Float[Array, "*batch legs"]
+    task: TaskConfig,
+    before: Float[Array, "*batch legs"],
+    after: Float[Array, "*batch legs"],
+    delay: Float[Array, "*#batch"] = AT_ONCE,
 ) -> Float[Array, "*batch sim_steps legs"]:
-    """Heights from one decision to the next: a straight line for `action_ramp`, then rest."""
-    share = np.minimum(np.arange(1, task.sim_steps + 1) / task.ramp_steps, 1.0)
-    share = share[:, None].astype(before.dtype)
+    """Heights from one decision to the next: a straight line for `action_ramp`, then rest.
+
+    Args:
+      task: sizes of the physics step, the decision and the ramp.
+      before: foot heights at the last decision, m.
+      after: foot heights after this one, m.
+      delay: physics steps until the legs begin to move; a NumPy array is a constant of the program.
+    """
+    share = (np.arange(1, task.sim_steps + 1) - delay[..., None]) / task.ramp_steps
+    share = share.__array_namespace__().clip(share, 0.0, 1.0)[..., None].astype(before.dtype)
     return before[..., None, :] * (1 - share) + after[..., None, :] * share

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.robots.catalogue import Robot
+from mjx_balance.robots.limits import delay_steps
 from mjx_balance.task import Array, kinematics, tilt
 from mjx_balance.task.actions import apply_action
 from mjx_balance.task.observation import Signals, extend_history, input_rows, lookback, observe
@@ -134,7 +135,8 @@ def pre_step(
     """Turns an action, a_x and a_y in m, into servo targets and the memory with the new command.
 
     Targets of step i are for time (i + 1) * sim_dt of the decision. With an action delay the legs
-    obey one decision later. `state.physics` does not matter.
+    obey one decision later; with a command delay of the robot, so much later in the decision.
+    `state.physics` does not matter.
     """
     memory, xp = state.memory, state.memory.heights.__array_namespace__()
     last = memory.commanded[..., -1, :]
@@ -147,9 +149,11 @@ def pre_step(
     if task.platform:
         position = tilt.platform_position(task, state.scenario, time)
         board = xp.concatenate((board, position), axis=-1)
-    path = kinematics.ramp(task, memory.heights, heights)
-    moving = kinematics.joint_angles(robot, path[..., : task.ramp_steps, :])
-    resting = xp.repeat(moving[..., -1:, :, :], task.sim_steps - task.ramp_steps, axis=-3)
+    delay = delay_steps(task, robot)
+    path = kinematics.ramp(task, memory.heights, heights, np.asarray(delay, float))
+    arrival = delay + task.ramp_steps
+    moving = kinematics.joint_angles(robot, path[..., :arrival, :])
+    resting = xp.repeat(moving[..., -1:, :, :], task.sim_steps - arrival, axis=-3)
     commanded = extend_history(memory.commanded, command[..., None, :])
     memory = memory._replace(heights=heights, commanded=commanded)
     return memory, Targets(board, xp.concatenate((moving, resting), axis=-3))

@@ -66,6 +66,9 @@ def test_what_is_said_of_a_robot(spot: tuple[Scene, TiltTest]) -> None:
     assert int(share[1]) == round(100 * spot[1].torque_share.max())
     sliding = describe(spot[0], spot[1]._replace(creep=0.023))[11]
     assert "slides by 23 mm/s" in sliding
+    late = dataclasses.replace(spot[0].robot, command_delay=0.0125)
+    line = describe(dataclasses.replace(spot[0], robot=late), spot[1])[2]
+    assert line == lines[2] + "; obey after 12.5 ms"
 
 
 def test_signs_and_bends_are_said() -> None:

@@ -302,6 +302,7 @@ def test_a_files_own_numbers_win(tmp_path: Path) -> None:
         "knee_torque": "40.0",
         "body_height": "0.33",
         "action_max": "0.0025",
+        "command_delay": "0.02",
     }
     scene = scene_of(bodies.write_robot(tmp_path, imu="[0.1, 0.02, 0.03]", **numbers))
     model, robot = scene.model, scene.robot

@@ -78,6 +78,20 @@ def test_what_the_robot_can_do_is_possible(config: Config, robot: Robot) -> None
     assert check_robot(config, robot) is config
 
 
+def test_legs_that_obey_too_late_are_refused(robot: Robot) -> None:
+    """In a decision of 0.2 s, whose ramp takes 0.02, a command may come 0.18 s late."""
+    config = preset("paper")
+    late = dataclasses.replace(robot, command_delay=0.18)
+    assert check_robot(config, late) is config
+    late = dataclasses.replace(robot, command_delay=0.184)
+    message = (
+        "^command_delay of robot quadruped is 0.184 s; for the legs to arrive before the next "
+        "decision it must be at most 0.18: ctrl_dt, 0.2 s, less action_ramp's share of it$"
+    )
+    with pytest.raises(ConfigError, match=message):
+        check_robot(config, late)
+
+
 def test_another_robots_config_is_scaled_by_its_mass_and_size() -> None:
     """Of 83.5 kg and 0.3285 m, against 15.2 kg and 0.193 m: 5.493 and 1.702."""
     best = preset("best")

@@ -189,6 +189,21 @@ def test_without_a_delay_actions_are_taken_at_once(task: TaskConfig, robot: Robo
     jax.tree.map(np.testing.assert_array_equal, *results)
 
 
+def test_the_legs_of_a_late_robot_follow_some_physics_steps_later(
+    task: TaskConfig, robot: Robot
+) -> None:
+    """By 21 ms, 5 whole steps of 4 ms; the board and what the robot remembers do not wait."""
+    late = dataclasses.replace(robot, command_delay=0.021)
+    memory, targets = step.pre_step(task, robot, before(range(N)), CHANGE)
+    after, delayed = step.pre_step(task, late, before(range(N)), CHANGE)
+    jax.tree.map(np.testing.assert_array_equal, after, memory)
+    np.testing.assert_array_equal(delayed.board, targets.board)
+    np.testing.assert_allclose(delayed.joints[:, 5:], targets.joints[:, :-5], rtol=0, atol=1e-15)
+    lean = np.arccos((random_memory().heights - 0.022) / 0.426)
+    waiting = np.stack((0 * lean, lean, -2 * lean), axis=-1)
+    np.testing.assert_allclose(delayed.joints[:, :5], np.stack([waiting] * 5, axis=1), atol=1e-12)
+
+
 def test_observation_entry_by_entry(xp: types.ModuleType, task: TaskConfig, apply: Any) -> None:
     """Measured heights, commands of now and two decisions ago, gyro, accelerometer."""
     memory, motion = random_memory(), random_motion()

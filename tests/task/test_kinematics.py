@@ -104,6 +104,18 @@ def test_ramp_is_a_walk_of_equal_steps(share: float, ratio: int, data: st.DataOb
     np.testing.assert_array_equal(got[moving - 1 :], np.tile(after, (ratio - moving + 1, 1)))
 
 
+def test_late_legs_do_the_same_whole_steps_later(xp: types.ModuleType) -> None:
+    """Each of a batch by its own delay; until then they stay where they were."""
+    before, after = xp.full((3, 4), 0.30), xp.full((3, 4), 0.35)
+    task = TaskConfig(action_ramp=0.4)
+    at_once = np.asarray(ramp(task, before, after))
+    late = np.asarray(ramp(task, before, after, xp.asarray([0.0, 1.0, 30.0])))
+    for got, expected, delay in zip(late, at_once, (0, 1, 30), strict=True):
+        np.testing.assert_allclose(got[:delay], 0.30, atol=1e-7)
+        np.testing.assert_allclose(got[delay:], expected[: 50 - delay], atol=1e-7)
+    assert late.dtype == at_once.dtype
+
+
 def test_single_precision_stays_single(robot: Robot) -> None:
     """A float64 that slips in would double the memory of every env."""
     heights = np.full((3, 4), 0.35, np.float32)
