@@ -181,8 +181,7 @@ def _stance(scene: Scene) -> str:
 def _implausible(scene: Scene) -> Iterator[str]:
     """Warns of torque limits that no robot of its weight has."""
     robot = scene.robot
-    leg = float(np.mean(robot.each("thigh") + robot.each("calf")))
-    holds = robot.total_mass * -scene.model.opt.gravity[2] * leg
+    holds = robot.total_mass * -scene.model.opt.gravity[2] * robot.leg_length
     for name in ("hip_torque", "knee_torque"):
         torque = getattr(robot, name)
         if torque > MAX_TORQUE * holds and torque != UNLIMITED:

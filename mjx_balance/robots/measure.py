@@ -167,7 +167,7 @@ def _check_limits(file: RobotFile, model: mujoco.MjModel) -> None:
 
 def _check_units(body: Body, model: mujoco.MjModel) -> None:
     """Refuses sizes, masses and moments of inertia that no robot has; its model has other units."""
-    leg = float(np.mean(body.each("thigh") + body.each("calf")))
+    leg = body.leg_length
     spans = [float(np.ptp(body.each(axis))) for axis in "xy"]
     density = body.total_mass / max(math.prod(spans) * leg, 1e-12)
     least, most = DENSITY
@@ -215,7 +215,7 @@ def _gain_scale(robot: Body, height: float) -> float:
     oscillation decays as early in a decision and the gyro then reads the board's rate. Gravity
     grows in proportion as robots get smaller; `LEAST_STIFFNESS` keeps small ones from sagging.
     """
-    leg = float(np.mean([leg.thigh + leg.calf for leg in robot.legs]))
+    leg = robot.leg_length
     narrow = min(robot.half_track, robot.half_length)
     longer = (leg * height / narrow) / (OUR_LEG * OUR_HEIGHT / OUR_HALF_TRACK)
     least = LEAST_STIFFNESS * robot.total_mass * GRAVITY * leg / OUR_STIFFNESS

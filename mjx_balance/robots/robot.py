@@ -82,6 +82,11 @@ class Body:
         return max(float(np.ptp(self.each(axis))) / 2 for axis in "xy")
 
     @property
+    def leg_length(self) -> float:
+        """Mean length of thigh and calf together, m."""
+        return float(np.mean(self.each("thigh") + self.each("calf")))
+
+    @property
     def height_range(self) -> tuple[float, float]:
         """Least and greatest body height above the board that all legs reach, m."""
         ends = [sorted(map(leg.height, leg.knee)) for leg in self.legs]
