@@ -1,8 +1,10 @@
 """Builds the MuJoCo model from `scenes/*.xml`, a task and a robot; finds the standing state."""
 
+import copy
 import dataclasses
 import functools
 import hashlib
+import math
 
 import mujoco
 import numpy as np
@@ -12,6 +14,7 @@ from mjx_balance.config import Config, ConfigError, TaskConfig
 from mjx_balance.robots.build import ACCELEROMETER, BOARD_SIZE, GYRO, VISUAL_GROUP
 from mjx_balance.robots.catalogue import Robot, find_robot, robot_file, robot_spec
 from mjx_balance.robots.limits import check_robot
+from mjx_balance.robots.measure import OUR_LEG, OUR_STIFFNESS
 from mjx_balance.robots.model import scene_dir
 from mjx_balance.task import Array
 from mjx_balance.task.kinematics import joint_angles
@@ -22,6 +25,10 @@ SLIDES = ("surge", "sway", "heave")
 CONTACT_TIME = 0.01  #: of the foot contacts, s: near the shortest that 4 ms steps carry
 SETTLE_STEPS = 750
 SETTLE_ROUNDS = 4
+TRIM_ERROR = 1e-3  #: greatest distance of a joint from its target, rad
+NUDGE = 0.05  #: along both axes, m/s; a robot on too soft servos does not come to rest after it
+NUDGE_STEPS = 7_500
+LEAST_STEP = 1.05  #: precision of the least stiffness in an error, as a factor
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,27 +208,87 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
 def _settle(layout: Layout) -> Stance:
     """Lets the robot come to rest on the level board with its joints at their targets.
 
-    Each round adds the servos' error under load to the trim, as an integral term would.
+    On soft servos a robot sags by more than their error, so that the trim does not settle. Then
+    stiff servos carry it first.
+    """
+    data, trim = _rest(layout, np.ones((len(layout.leg_ctrl), 3)))
+    if not (_is_still(layout, data) and _is_at_targets(layout, data)):
+        data, trim = _rest(layout, np.maximum(_stiffness(layout.robot) / _gains(layout), 1))
+        if not _endures(layout, data):
+            raise ConfigError(_why_unsettled(layout, data))
+    state = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
+    return Stance(*state, trim, data.sensordata[layout.imu].copy())
+
+
+def _rest(
+    layout: Layout, stiffer: Float[np.ndarray, "legs 3"]
+) -> tuple[mujoco.MjData, Float[np.ndarray, "legs 3"]]:
+    """Lets the robot come to rest, if it does; returns its state and its trim.
+
+    Each round adds the servos' error under load to the trim, as an integral term would. The servos
+    are so many times stiffer until the last round, in which the trim gives the torque of before.
     """
     model, legs, height = layout.model, layout.leg_qpos, layout.task.body_height
     servos, root = layout.leg_ctrl, layout.trunk_quat[0] - 3
-    angles = joint_angles(layout.robot, np.full(len(legs), height))
+    angles = _standing_angles(layout)
     trim = np.zeros_like(angles)
     data = mujoco.MjData(model)
     data.qpos[root : root + 7] = (0, 0, height, 1, 0, 0, 0)
     data.qpos[legs] = angles
+    stiff = _with_gains(layout, stiffer)
+    stiff.dof_damping[model.jnt_dofadr[model.actuator_trnid[servos, 0]]] *= stiffer
     for _ in range(SETTLE_ROUNDS):
         data.ctrl[servos] = angles + trim
-        mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
+        mujoco.mj_step(stiff, data, nstep=SETTLE_STEPS)
         trim = trim + angles - data.qpos[legs]
+    trim = trim * stiffer
     data.ctrl[servos] = angles + trim
     data.qpos[root : root + 2] = 0
     mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
-    upright = np.abs(data.qpos[root + 4 : root + 6]).max() < 0.01
-    if not (upright and np.abs(data.qvel).max() < 0.01):
-        raise ConfigError(_why_unsettled(layout, data))
-    state = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
-    return Stance(*state, trim, data.sensordata[layout.imu].copy())
+    return data, trim
+
+
+def _standing_angles(layout: Layout) -> Float[np.ndarray, "legs 3"]:
+    """Joint angles of the robot at `body_height`, rad."""
+    heights = np.full(len(layout.leg_ctrl), layout.task.body_height)
+    return joint_angles(layout.robot, heights)
+
+
+def _gains(layout: Layout) -> Float[np.ndarray, "legs 3"]:
+    """Stiffness of the servos, N m / rad."""
+    return layout.model.actuator_gainprm[layout.leg_ctrl, 0]
+
+
+def _with_gains(layout: Layout, factor: float | np.ndarray) -> mujoco.MjModel:
+    """The model with servos so many times as stiff."""
+    model, servos = copy.copy(layout.model), layout.leg_ctrl
+    model.actuator_gainprm[servos, 0] *= factor
+    model.actuator_biasprm[servos, 1] *= factor
+    return model
+
+
+def _stiffness(robot: Robot) -> float:
+    """Stiffness like our own robot's, relative to weight times leg length, N m / rad."""
+    return OUR_STIFFNESS * robot.mass_scale * robot.leg_length / OUR_LEG
+
+
+def _is_still(layout: Layout, data: mujoco.MjData) -> bool:
+    """Whether the robot is upright and at rest."""
+    upright = np.abs(data.qpos[layout.trunk_quat[1:3]]).max() < 0.01
+    return bool(upright and np.abs(data.qvel).max() < 0.01)
+
+
+def _is_at_targets(layout: Layout, data: mujoco.MjData) -> bool:
+    """Whether the trim holds the joints at the angles of the standing robot."""
+    return np.abs(data.qpos[layout.leg_qpos] - _standing_angles(layout)).max() < TRIM_ERROR
+
+
+def _endures(layout: Layout, data: mujoco.MjData) -> bool:
+    """Whether the robot is still, and comes to rest again after a nudge."""
+    nudged = copy.copy(data)
+    nudged.qvel[layout.trunk_velocity] += NUDGE
+    mujoco.mj_step(layout.model, nudged, nstep=NUDGE_STEPS)
+    return _is_still(layout, data) and _is_still(layout, nudged)
 
 
 def _why_unsettled(layout: Layout, data: mujoco.MjData) -> str:
@@ -238,12 +305,13 @@ def _why_unsettled(layout: Layout, data: mujoco.MjData) -> str:
         )
     return (
         f"robot {robot.name} does not stand still at body_height {height} m with "
-        f"servo_stiffness {robot.servo_stiffness:g} N m/rad: {_why_unbalanced(layout)}"
+        f"servo_stiffness {robot.servo_stiffness:g} N m/rad: "
+        f"{_why_unbalanced(layout) or _why_too_soft(layout) or _what_to_leave_out(layout)}"
     )
 
 
 def _why_unbalanced(layout: Layout) -> str:
-    """Where the centre of mass is if it is not above the feet; else what to leave to the rules."""
+    """Where the centre of mass is if it is not above the feet."""
     data, robot = mujoco.MjData(layout.model), layout.robot
     data.qpos[layout.trunk_quat[0]] = 1
     mujoco.mj_forward(layout.model, data)
@@ -256,6 +324,33 @@ def _why_unbalanced(layout: Layout) -> str:
                 f"the trunk's origin, and its feet stand from {1000 * least:.0f} to "
                 f"{1000 * most:.0f} mm"
             )
+    return ""
+
+
+def _why_too_soft(layout: Layout) -> str:
+    """The least stiffness with which the robot stands, if it does with stiff servos."""
+    most = float(np.max(_stiffness(layout.robot) / _gains(layout)))
+
+    def stands(factor: float) -> bool:
+        model = _with_gains(layout, factor)
+        stiffer = dataclasses.replace(layout, model=model)
+        data, _ = _rest(stiffer, np.full((len(layout.leg_ctrl), 3), most / factor))
+        return _endures(stiffer, data)
+
+    if most <= 1 or not stands(most):
+        return ""
+    low, high = 1.0, most
+    while high / low > LEAST_STEP:
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if stands(middle) else (middle, high)
+    least = high * layout.robot.servo_stiffness
+    digit = 10.0 ** (math.floor(math.log10(least)) - 1)
+    least = digit * math.ceil(least / digit)
+    return f"its weight bends them ever further; servo_stiffness must be at least {least:g}"
+
+
+def _what_to_leave_out(layout: Layout) -> str:
+    """Which numbers of the file to leave to the rules."""
     file = robot_file(layout.robot_source)
     names = ("servo_stiffness", "servo_damping", "servo_armature", "body_height")
     given = [name for name in names if getattr(file, name) is not None]

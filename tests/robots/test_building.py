@@ -754,8 +754,14 @@ STRONG = {"knee_torque": "500", "hip_torque": "500"}
         ),
         (
             [],
-            STRONG | {"servo_stiffness": "30"},
-            "with servo_stiffness 30 N m/rad: leave out servo_stiffness of its file",
+            STRONG | {"servo_stiffness": "20", "servo_damping": "1"},
+            "with servo_stiffness 20 N m/rad: its weight bends them ever further; servo_stiffness "
+            "must be at least 2[345]$",
+        ),
+        (
+            [],
+            STRONG | {"servo_stiffness": "1e6"},
+            r"with servo_stiffness 1e\+06 N m/rad: leave out servo_stiffness of its file",
         ),
         (
             [('mass="6.92"', 'mass="400"')],
@@ -776,6 +782,26 @@ def test_why_it_does_not_stand(
     name = bodies.write_robot(tmp_path, edits, **extra)
     with pytest.raises(ConfigError, match=message):
         scene_of(name)
+
+
+@pytest.mark.parametrize("gains", [(60, 4), (40, 2), (30, 1.5), (25, 1)])
+def test_a_robot_on_soft_servos_stands(gains: tuple[float, float], tmp_path: Path) -> None:
+    """At its height, each servo off its target by torque over stiffness; 10 s later as well."""
+    stiffness, damping = gains
+    name = bodies.write_robot(tmp_path, servo_stiffness=f"{stiffness}", servo_damping=f"{damping}")
+    scene = scene_of(name)
+    data, stance = mujoco.MjData(scene.model), scene.stance
+    data.qpos[:] = stance.qpos
+    angles = joint_angles(scene.robot, np.full(4, 0.35))
+    data.ctrl[scene.leg_ctrl] = angles + stance.leg_trim
+    mujoco.mj_step(scene.model, data, nstep=2500)
+    trunk = scene.trunk_quat[0] - 3
+    np.testing.assert_allclose(data.qpos[trunk : trunk + 3], (0, 0, 0.35), atol=1.5e-3)
+    np.testing.assert_allclose(data.qpos[scene.leg_qpos], angles, atol=1e-3)
+    mujoco.mj_forward(scene.model, data)
+    torque = data.actuator_force[scene.leg_ctrl]
+    assert np.abs(torque[:, 2]).min() > 1, "knees carry the robot"
+    np.testing.assert_allclose(torque / stiffness, stance.leg_trim, atol=1e-3)
 
 
 def test_a_spec_is_new_each_time() -> None:
