@@ -51,6 +51,8 @@ SCALES = (float(np.float32(1e-6)), 1e6)  #: bounds of an input's scale; they kee
 MOST_TURN = 16.0  #: greatest turn of a joint at angle 0, rad; two and a half turns are 15.7
 MOST_WHOLE = 100_000  #: bound of a manifest's numbers
 MOMENTARY = ("height",)  #: sensors with one sample per decision and no history
+TIMES = (1e-6, 10_000.0)  #: bounds of an input's time constant, s
+STANDING_S = 1.0  #: time for which the first sample counts in a leaky mean, s
 MOST_READ = 1_000_000  #: greatest number of samples that all inputs together average
 GYRO_MOST = 35.0  #: greatest gyro reading, rad/s; the widest usual range is 2,000 deg/s
 ACCEL_MOST = 160.0  #: greatest accelerometer reading, m/s^2; a usual range is 16 g
@@ -140,7 +142,7 @@ class Controller:
             )
         self._table = _numbers("table_m", manifest["actions"]["table_m"], (None, 2))
 
-        self._inputs = inputs = _Inputs(manifest["inputs"], len(self.joints))
+        self._inputs = inputs = _Inputs(manifest["inputs"], len(self.joints), self.sample_dt)
         self._recent = min(max(self.decision_samples, RECENT[0]), RECENT[1])
         self._history = max(inputs.lookback("gyro", "accelerometer"), self._recent)
         # Joints at the decisions of the time that is checked for repetitions.
@@ -237,6 +239,7 @@ class Controller:
         self._seen += 1
         if self.state is State.STANDING:
             self._imu[:] = self._reading[-IMU:]
+            self._inputs.means.start(self._reading[-IMU:])
             self._poses.clear()
             self._poses.append(self._reading[:-IMU].copy())
             self._there = self._targets.ravel()
@@ -246,6 +249,7 @@ class Controller:
         else:
             self._check_time(now)
             self._imu[self._history + self._since] = self._reading[-IMU:]
+            self._inputs.means.add(self._reading[-IMU:])
             self._since += 1
             if self._since == self.decision_samples:
                 self._check_rate(now)
@@ -383,13 +387,20 @@ class Controller:
 
 
 class _Inputs:
-    """The network's inputs: (mean of `window` samples from `lag` on - offset) / scale."""
+    """The network's inputs: (mean of `window` samples from `lag` on - offset) / scale.
 
-    def __init__(self, rows: list[dict[str, Any]], legs: int) -> None:
+    Inputs with a time constant are means over all samples since the start (`_Means`).
+    """
+
+    def __init__(self, rows: list[dict[str, Any]], legs: int, sample_dt: float) -> None:
         channels = {"height": legs, "command": legs, "gyro": 3, "accelerometer": 3}
         self._ages = dict.fromkeys(channels, 1)
         groups: dict[tuple[str, int], list[tuple[int, int, int]]] = {}
+        slow = [k for k, row in enumerate(rows) if row.get("time_constant") is not None]
+        self._slow, self.means = slow, _Means([rows[k] for k in slow], sample_dt)
         for k, row in enumerate(rows):
+            if k in slow:
+                continue
             sensor = row["sensor"]
             if sensor not in channels:
                 raise PolicyFileError(
@@ -419,9 +430,60 @@ class _Inputs:
     def observe(self, samples: dict[str, np.ndarray]) -> np.ndarray:
         """Inputs (size,) from {sensor: samples (n, channels), the newest last}."""
         values = np.empty(self.size)
+        values[self._slow] = self.means.values()
         for sensor, places, steps, index in self._groups:
             values[places] = samples[sensor][steps, index].mean(axis=0)
         return (values - self._offset) / self._scale
+
+
+class _Means:
+    """Leaky means of gyro and accelerometer, and the angles of complementary filters.
+
+    Weighted means of all samples, whose weights fall by 1/e in a time constant tau. An angle is the
+    mean of gravity's angle + tau * gyro: it integrates the gyro and leans toward gravity's angle.
+    """
+
+    def __init__(self, rows: list[dict[str, Any]], sample_dt: float) -> None:
+        kinds = {"gyro": (0, 3), "accelerometer": (3, 3), "angle": (IMU, 2)}
+        times, places = [], []
+        for row in rows:
+            sensor = row["sensor"]
+            if sensor not in kinds:
+                raise PolicyFileError(
+                    f"its inputs have a mean of the sensor {_quote(sensor)}; this file knows means "
+                    f"of {', '.join(kinds)}"
+                )
+            first, count = kinds[sensor]
+            places.append(first + _whole("index", row["index"], 0, count - 1))
+            times.append(_number("time_constant", row["time_constant"], *TIMES))
+        self._places, tau = np.asarray(places, int), np.asarray(times)
+        self._angle = angle = self._places >= IMU
+        self._turns, self._times = self._places[angle] - IMU, tau[angle]
+        self._leak = sample_dt / (tau + sample_dt)
+        start = 1 - (1 - self._leak) ** round(STANDING_S / sample_dt)
+        self._start = np.where(angle, 1.0, start)
+
+    def start(self, imu: np.ndarray) -> None:
+        """Takes the first sample (6,), of a robot that has been standing still."""
+        self._weight = self._start.copy()
+        self._sum = self._weight * self._samples(imu)
+
+    def add(self, imu: np.ndarray) -> None:
+        """Takes another sample (6,)."""
+        if len(self._leak):
+            self._sum += self._leak * (self._samples(imu) - self._sum)
+            self._weight += self._leak * (1 - self._weight)
+
+    def values(self) -> np.ndarray:
+        """The means now, in the order of the rows."""
+        return self._sum / self._weight
+
+    def _samples(self, imu: np.ndarray) -> np.ndarray:
+        x, y, z = imu[3:]
+        gravity = math.atan2(y, z), math.atan2(-x, math.hypot(y, z))
+        samples = np.append(imu, gravity)[self._places]
+        samples[self._angle] += self._times * imu[self._turns]
+        return samples
 
 
 class _Legs:

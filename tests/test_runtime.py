@@ -135,6 +135,7 @@ LAYOUTS: dict[str, tuple[str, dict[str, Any]]] = {
     "levels": ("factored", {"action_levels": 5, "command_lags": (1,), "action_max": 0.02}),
     "rates": ("radial", {"ctrl_dt": 0.05, "sim_dt": 0.005, "action_ramp": 0.01, "imu_mean": 2}),
     "off the grid": ("radial", {"action": "continuous", "command_lags": (0, 1)}),
+    "long memory": ("radial", {"mean_times": (0.5, 30.0), "filter_times": (4.0, 0.3)}),
     "every sample": ("radial", {"ctrl_dt": 0.004, "action_ramp": 0.5}),
 }
 

@@ -3,6 +3,7 @@
 from mjx_balance.config.presets import PRESETS, preset
 from mjx_balance.config.schema import (
     ACTION_AXES,
+    DEGREE,
     Config,
     ConfigError,
     DQNConfig,

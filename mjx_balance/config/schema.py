@@ -32,6 +32,7 @@ Count = Annotated[int, Ge(1), Le(MOST_COUNT)]
 CountFrom0 = Annotated[int, Ge(0), Le(MOST_COUNT)]
 Lags = Annotated[tuple[Annotated[int, Ge(0), Le(10_000)], ...], Len(1, MOST_LAGS)]
 CommandLags = Annotated[tuple[Annotated[int, Ge(0), Le(1_000)], ...], MaxLen(MOST_LAGS)]
+Times = Annotated[tuple[Annotated[float, Ge(1e-6), Le(10_000)], ...], MaxLen(MOST_LAGS)]
 
 
 class ConfigError(InputError):
@@ -99,6 +100,12 @@ class TaskConfig:
     command_lags: CommandLags = ()
     """Lags, in decisions, of the commanded foot heights in the observation: compared with the
     measured heights they show delayed actions and compliant legs (paper Eq. 2: none)."""
+    mean_times: Times = ()
+    """Time constants of leaky means of gyro and accelerometer in the observation, s: they show what
+    stays the same, such as a bias (paper Eq. 2: none)."""
+    filter_times: Times = ()
+    """Time constants of complementary filters, s, whose roll and pitch are in the observation
+    (paper Eq. 2: none)."""
     height_scale: Scale = 0.01
     """Foot height relative to the standing height that enters the network as 1, m (chosen)."""
     gyro_scale: Scale = DEGREE

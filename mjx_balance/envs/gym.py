@@ -93,8 +93,9 @@ class _Balance:
         single = shares if self._table is None else spaces.Discrete(len(self._table))
         self.action_space = self.single_action_space = single
         # All that `task.step` lets through; larger values are a diverged simulation's.
-        scale = [row.scale for row in input_rows(task, self.scene.robot)]
-        most = DIVERGED / np.asarray(scale, np.float32)
+        rows = input_rows(task, self.scene.robot)
+        most = [DIVERGED * (1 + (row.time_constant or 0)) / row.scale for row in rows]
+        most = np.asarray(most, np.float32)
         self.observation_space = self.single_observation_space = spaces.Box(-most, most)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from mjx_balance.errors import InputError
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task import tilt
 from mjx_balance.task.actions import to_command
-from mjx_balance.task.attitude import roll_pitch
+from mjx_balance.task.attitude import gravity_angles, roll_pitch
 
 HORIZON = 8  #: decisions that the predictive controllers look ahead
 SWEEPS = 25  #: rounds of coordinate descent of the predictive controllers
@@ -129,10 +129,7 @@ class ImuPD(AttitudePD):
         """Filters the last decision's samples; see `AttitudePD.state`."""
         if view.env_steps == 0:
             self.angle = np.zeros((view.ids.max() + 1, ACTION_AXES))
-        gyro, accel = view.imu[..., :2], view.imu[..., 3:]
-        lean = np.arctan2(accel[..., 1], accel[..., 2])
-        nod = np.arctan2(-accel[..., 0], np.hypot(accel[..., 1], accel[..., 2]))
-        by_gravity = np.stack((lean, nod), axis=-1)
+        gyro, by_gravity = view.imu[..., :2], gravity_angles(view.imu[..., 3:])
         dt = self.task.sim_dt
         leak = dt / (self.tau + dt)
         weight = (1 - leak) ** np.arange(view.imu.shape[1])[::-1, None]

@@ -17,7 +17,7 @@ from mjx_balance.files.validation import parse
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import check_body, check_robot
 from mjx_balance.task.actions import action_table
-from mjx_balance.task.observation import input_rows
+from mjx_balance.task.observation import Row, input_rows
 from mjx_balance.text import quote
 
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
@@ -65,9 +65,7 @@ def describe(config: Config, robot: Robot) -> dict[str, Any]:
     task = config.task
     return {
         "robot": to_dict(robot),
-        "inputs": [
-            row._asdict() | {"mirror": row.mirror._asdict()} for row in input_rows(task, robot)
-        ],
+        "inputs": [_input(row) for row in input_rows(task, robot)],
         "network": {
             "hidden_sizes": list(config.dqn.hidden_sizes),
             "factors": list(network_factors(config)),
@@ -83,6 +81,12 @@ def describe(config: Config, robot: Robot) -> dict[str, Any]:
         "body_height_m": task.body_height,
         "fail_tilt_deg": task.fail_tilt,
     }
+
+
+def _input(row: Row) -> dict[str, Any]:
+    """A row as JSON values; only rows with a time constant have one, as in the first files."""
+    values = row._asdict() | {"mirror": row.mirror._asdict()}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def network_factors(config: Config) -> tuple[int, ...]:

@@ -17,6 +17,13 @@ def body_tilt(quat: Float[Array, "*batch 4"]) -> Float[Array, "*batch"]:
     return 2 * (180 / np.pi) * xp.arcsin(xp.clip(half_sine, 0.0, 1.0))
 
 
+def gravity_angles(accel: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
+    """Roll and pitch, rad, of a body at rest whose accelerometer reads `accel`, m/s^2."""
+    xp = accel.__array_namespace__()
+    x, y, z = accel[..., 0], accel[..., 1], accel[..., 2]
+    return xp.stack((xp.arctan2(y, z), xp.arctan2(-x, xp.hypot(y, z))), axis=-1)
+
+
 def roll_pitch(
     quat: Float[Array, "*batch 4"],
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from mjx_balance.config import TaskConfig
+from mjx_balance.config import DEGREE, TaskConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
@@ -25,17 +25,21 @@ class Mirror(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One input of the network: the mean of `window` samples, each less `offset`, over `scale`."""
+    """One input of the network: the mean of `window` samples, each less `offset`, over `scale`.
+
+    With a time constant it is a mean over all samples since the start instead (`task/means.py`).
+    """
 
     name: str  #: unique, e.g. `H_LF`, `C_LF,d-1`, `V_x,t-2`, `Acc_y,t-15`
     sensor: str  #: one of `SENSORS`
     index: int  # pyright: ignore[reportIncompatibleMethodOverride]
-    """Leg in the robot's order, or axis: 0, 1, 2 for x, y, z."""
+    """Leg in the robot's order, or axis: 0, 1, 2 for x, y, z; an angle is about x or y."""
     lag: int  #: age of the newest sample averaged, in samples of the sensor; 0 is the latest
     window: int  #: samples averaged, from there back
     offset: float  #: in the sensor's unit
     scale: float  #: size that enters the network as 1, in the sensor's unit; a float32
     mirror: Mirror
+    time_constant: float | None = None  #: s; lag is 0 then, and window 1
 
 
 class Signals(NamedTuple):
@@ -44,6 +48,8 @@ class Signals(NamedTuple):
     heights: Float[Array, "*batch 1 legs"]  #: measured foot heights, m
     commands: Float[Array, "*batch decisions legs"]  #: commanded, a sample per decision, m
     imu: Float[Array, "*batch samples 6"]  #: gyro, accelerometer, rad/s and m/s^2
+    means: Float[Array, "*batch 1 means"] | None = None
+    """Of the rows with a time constant, in their order and the sensor's unit."""
 
 
 class Sensor(NamedTuple):
@@ -58,6 +64,7 @@ SENSORS = {
     "command": Sensor("commands", 0),
     "gyro": Sensor("imu", 0),
     "accelerometer": Sensor("imu", 3),
+    "angle": Sensor("means", 0),  # of a complementary filter, so it needs a time constant
 }
 TURN_SIGNS, MOTION_SIGNS = (-1, 1, -1), (1, -1, 1)
 """Signs of x, y and z in the left-right mirror: of turns about them, of motion along them."""
@@ -69,7 +76,7 @@ def input_rows(task: TaskConfig, robot: Robot) -> tuple[Row, ...]:
 
     Measured heights, commanded heights lag by lag, then gyro x and y and accelerometer x and y at
     every lag (paper Eq. 2). With `task.imu_mean` = 5, `V_x,t-10` is the mean of the samples that
-    are 10 to 14 steps old.
+    are 10 to 14 steps old. Last are leaky means of gyro and accelerometer, then filtered angles.
     """
     height, scale, mean = task.body_height, task.height_scale, task.imu_mean
     rows = _leg_rows(robot, "H_{leg}", "height", height, scale)
@@ -79,6 +86,11 @@ def input_rows(task: TaskConfig, robot: Robot) -> tuple[Row, ...]:
     accelerometer = task.accel_lags, mean, task.accel_scale
     rows += _axis_rows("V_{axis},t-{lag}", "gyro", *gyro, TURN_SIGNS)
     rows += _axis_rows("Acc_{axis},t-{lag}", "accelerometer", *accelerometer, MOTION_SIGNS)
+    means, filters = task.mean_times, task.filter_times
+    rows += _mean_rows("V_{axis},mean", "gyro", means, task.gyro_scale, TURN_SIGNS)
+    scale = task.accel_scale
+    rows += _mean_rows("Acc_{axis},mean", "accelerometer", means, scale, MOTION_SIGNS)
+    rows += _mean_rows("Angle_{axis},filter", "angle", filters, DEGREE, TURN_SIGNS)
     return tuple(rows)
 
 
@@ -113,6 +125,17 @@ def _axis_rows(
     return rows
 
 
+def _mean_rows(
+    name: str, sensor: str, times: Sequence[float], scale: float, signs: Sequence[int]
+) -> list[Row]:
+    """A row per time constant and axis."""
+    return [
+        row._replace(time_constant=time)
+        for time in times
+        for row in _axis_rows(f"{name}-{time:g}", sensor, (0,), 1, scale, signs)
+    ]
+
+
 def observation_names(task: TaskConfig, robot: Robot) -> tuple[str, ...]:
     """Name of every observation entry, in order."""
     return tuple(row.name for row in input_rows(task, robot))
@@ -120,8 +143,17 @@ def observation_names(task: TaskConfig, robot: Robot) -> tuple[str, ...]:
 
 def lookback(rows: Sequence[Row], signal: str) -> int:
     """Samples of a signal that the rows look back on, the newest included; at least one."""
-    ages = [row.lag + row.window for row in rows if SENSORS[row.sensor].signal == signal]
+    ages = [row.lag + row.window for row in rows if _signal(row) == signal]
     return max(ages, default=1)
+
+
+def mean_rows(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """The rows with a time constant."""
+    return tuple(row for row in rows if row.time_constant is not None)
+
+
+def _signal(row: Row) -> str:
+    return SENSORS[row.sensor].signal if row.time_constant is None else "means"
 
 
 def observe(rows: tuple[Row, ...], signals: Signals) -> Float[Array, "... obs_size"]:
@@ -149,13 +181,16 @@ class _Run(NamedTuple):
 @functools.lru_cache(maxsize=16)
 def _compiled(rows: tuple[Row, ...]) -> tuple[list[_Run], Float32[np.ndarray, " obs_size"]]:
     """The rows as runs, and their scales."""
-    runs = []
+    runs, means = [], mean_rows(rows)
     for (signal, offset, window), group in itertools.groupby(
-        rows, key=lambda row: (SENSORS[row.sensor].signal, row.offset, row.window)
+        rows, key=lambda row: (_signal(row), row.offset, row.window)
     ):
         run = list(group)
         ages = np.arange(window)[:, None] + [row.lag for row in run]
-        channels = [SENSORS[row.sensor].channel + row.index for row in run]
+        channels = [
+            SENSORS[row.sensor].channel + row.index if signal != "means" else means.index(row)
+            for row in run
+        ]
         # JAX mixes traces of 32 and of 64 bits up where they index by the default type.
         runs.append(_Run(signal, offset, ages.astype(np.int32), np.asarray(channels, np.int32)))
     return runs, np.asarray([row.scale for row in rows], np.float32)

@@ -16,7 +16,15 @@ from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import delay_steps
 from mjx_balance.task import Array, kinematics, tilt
 from mjx_balance.task.actions import apply_action
-from mjx_balance.task.observation import Signals, extend_history, input_rows, lookback, observe
+from mjx_balance.task.means import Means, start_means, update_means
+from mjx_balance.task.observation import (
+    Signals,
+    extend_history,
+    input_rows,
+    lookback,
+    mean_rows,
+    observe,
+)
 from mjx_balance.task.pushes import Pushes, push_velocity
 from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.reward import RewardInputs, failed, reward_terms
@@ -33,6 +41,7 @@ class Memory(NamedTuple):
     here before the legs move."""
     imu: Float[Array, "*batch samples 6"]  #: latest IMU samples, the newest last, rad/s and m/s^2
     tilt: Float[Array, "*batch"]  #: body tilt of the last reward, deg
+    means: Means | None = None  #: None: no row of the observation has a time constant
 
 
 class Targets(NamedTuple):
@@ -121,11 +130,13 @@ def initial_memory(task: TaskConfig, robot: Robot, still: Float[Array, "*batch 6
     """The memory of a robot that has been standing for a while, with IMU samples `still`."""
     xp, rows = still.__array_namespace__(), input_rows(task, robot)
     heights = xp.full((*still.shape[:-1], len(robot.legs)), task.body_height, still.dtype)
+    means = mean_rows(rows)
     return Memory(
         heights=heights,
         commanded=xp.repeat(heights[..., None, :], lookback(rows, "commands"), axis=-2),
         imu=xp.repeat(still[..., None, :], lookback(rows, "imu"), axis=-2),
         tilt=xp.zeros_like(still[..., 0]),
+        means=start_means(means, task.sim_dt, still) if means else None,
     )
 
 
@@ -181,7 +192,11 @@ def post_step(
     after = tilts.mean(axis=-1) if task.reward_tilt == "mean" else tilts[..., -1]
     inputs = RewardInputs(memory.tilt, after, terminated.astype(after.dtype))
     rewards = reward_terms(task, inputs)
-    memory = memory._replace(imu=extend_history(memory.imu, samples), tilt=after)
+    means = memory.means
+    if means is not None:
+        means = update_means(mean_rows(input_rows(task, robot)), task.sim_dt, means, samples)
+    imu = extend_history(memory.imu, samples)
+    memory = memory._replace(imu=imu, tilt=after, means=means)
     obs = observation(task, robot, memory, angles)
     return memory, Outcome(obs, rewards, samples, tilts, terminated, diverged)
 
@@ -197,5 +212,8 @@ def observation(
 ) -> Float[Array, "*batch obs_size"]:
     """The network's input, for measured joint angles, rad."""
     heights = kinematics.foot_heights(robot, angles)
-    signals = Signals(heights[..., None, :], memory.commanded, memory.imu)
+    means = memory.means
+    if means is not None:
+        means = means[..., :1, :] / means[..., 1:, :]
+    signals = Signals(heights[..., None, :], memory.commanded, memory.imu, means)
     return observe(input_rows(task, robot), signals)

@@ -171,6 +171,7 @@ BOUNDS: list[tuple[str, tuple[Any, ...], tuple[Any, ...]]] = [
     ("gyro_lags accel_lags", ((0,), (30, 2)), ((), (-1,), (3, -2), (10_001,))),
     ("command_lags", ((), (0,), (3, 1)), ((-1,), (2, -1), (1_001,))),
     ("imu_mean", (1, 10), (0, -1, 10_001)),
+    ("mean_times filter_times", ((), (0.5,), (30.0, 4.0)), ((0.0,), (4.0, -1.0), (10_001.0,))),
     ("height_scale gyro_scale accel_scale reward_toward_scale", (1e-3, 1.0), (0.0, -0.01)),
     ("reward_level reward_toward reward_fail", (-1e6, 1e6), (-1.1e6, 1.1e6)),
     ("reward_sharpness", (0.0, 10.0), (-0.1,)),
@@ -379,6 +380,8 @@ def wrong(hint: Any) -> list[Any]:
     if typing.get_origin(hint) is tuple:
         values = ["many", 3, {"a": 1}, [None], [[1]], ["x"], [True], [1.5]]
         values.remove(["x"] if hint == tuple[str, ...] else "many")
+        if hint == tuple[float, ...]:
+            values.remove([1.5])
     if hint in (int, int | None):
         values += [2.5]
     if type(None) not in typing.get_args(hint):

@@ -44,7 +44,7 @@ def roll_pitch(fleet: Any, states: list[Any]) -> np.ndarray:
 
 
 def test_starts_settled_and_level(fleet: Any, config: Config) -> None:
-    for env, size in ((fleet.env, 4 + 8 + 6 + 6), (BalanceEnv(config), 34)):
+    for env, size in ((fleet.env, 4 + 8 + 6 + 6 + 4 + 2), (BalanceEnv(config), 34)):
         state: Any = jax.jit(env.reset)(jax.random.PRNGKey(0))
         assert jnp.shape(state.obs) == (env.observation_size,) == (size,)
         # In units of 1 cm, 1 deg/s and 1 deg: nothing moves, nothing tilts.

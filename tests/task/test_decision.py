@@ -112,7 +112,7 @@ def test_a_standing_robot_has_always_stood(
     np.testing.assert_array_equal(memory.imu, np.tile(still[:, None], (63, 1)))
     np.testing.assert_array_equal(memory.tilt, np.zeros(2))
     one = step.initial_memory(task, robot, put(xp, still[1]))
-    assert [x.shape for x in one] == [(4,), (3, 4), (63, 6), ()]
+    assert [x.shape for x in one[:4]] == [(4,), (3, 4), (63, 6), ()]
     np.testing.assert_array_equal(one.imu, memory.imu[1])
 
 

@@ -61,11 +61,18 @@ def test_one_is_a_centimetre_a_degree_per_second_and_a_degree_of_gravity(robot: 
 
 
 def test_order_of_the_names(robot: Robot) -> None:
-    """Heights, commands lag by lag, then gyro x, gyro y, accelerometer x, accelerometer y."""
-    task = TaskConfig(command_lags=(0, 2), gyro_lags=(3, 1), accel_lags=(5,))
+    """Heights, commands lag by lag, gyro x, gyro y, accelerometer x and y, means, angles."""
+    task = TaskConfig(
+        command_lags=(0, 2),
+        gyro_lags=(3, 1),
+        accel_lags=(5,),
+        mean_times=(9.0,),
+        filter_times=(0.5,),
+    )
     expected = (
         "H_LF H_RF H_LH H_RH C_LF,d-0 C_RF,d-0 C_LH,d-0 C_RH,d-0 C_LF,d-2 C_RF,d-2 C_LH,d-2 "
-        "C_RH,d-2 V_x,t-3 V_x,t-1 V_y,t-3 V_y,t-1 Acc_x,t-5 Acc_y,t-5"
+        "C_RH,d-2 V_x,t-3 V_x,t-1 V_y,t-3 V_y,t-1 Acc_x,t-5 Acc_y,t-5 "
+        "V_x,mean-9 V_y,mean-9 Acc_x,mean-9 Acc_y,mean-9 Angle_x,filter-0.5 Angle_y,filter-0.5"
     )
     assert observation_names(task, robot) == tuple(expected.split())
 
@@ -94,7 +101,7 @@ def test_every_entry_is_what_its_name_says(robot: Robot, task: TaskConfig, seed:
     rng, rows = np.random.default_rng(seed), input_rows(task, robot)
     memory = max(*task.gyro_lags, *task.accel_lags) + task.imu_mean
     decisions = max(task.command_lags, default=0) + 1
-    assert [lookback(rows, x) for x in Signals._fields] == [1, decisions, memory]
+    assert [lookback(rows, x) for x in Signals._fields[:3]] == [1, decisions, memory]
     heights, commands = rng.normal(size=(2, 1, 4)), rng.normal(size=(2, decisions, 4))
     imu = rng.normal(size=(2, memory, 6))
     got = observe(rows, Signals(heights, commands, imu))

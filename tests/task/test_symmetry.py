@@ -23,7 +23,13 @@ from mjx_balance.task.tilt import Scenario
 def rich(config: Config) -> Config:
     """Observations with commands and means, of unequally many gyro and accelerometer lags."""
     task = dataclasses.replace(
-        config.task, command_lags=(0, 1), gyro_lags=(0, 7), accel_lags=(0, 3, 9), imu_mean=2
+        config.task,
+        command_lags=(0, 1),
+        gyro_lags=(0, 7),
+        accel_lags=(0, 3, 9),
+        imu_mean=2,
+        mean_times=(1.0,),
+        filter_times=(4.0, 1.0),
     )
     return dataclasses.replace(config, task=task)
 
@@ -55,7 +61,7 @@ def test_the_identity_and_one_mirror_that_is_its_own_inverse(
 
 
 def test_left_right_by_name(any_config: Config, robot: Robot) -> None:
-    """Roll rate, lateral acceleration and a_x turn; left and right legs swap."""
+    """Roll, its rate, lateral acceleration and a_x turn; left and right legs swap."""
     group = symmetries(any_config.task, robot)
     names = observation_names(any_config.task, robot)
     legs = {"LF": "RF", "RF": "LF", "LH": "RH", "RH": "LH"}
@@ -63,7 +69,8 @@ def test_left_right_by_name(any_config: Config, robot: Robot) -> None:
         leg = name.split(",")[0][2:]
         expected = name.replace(leg, legs[leg]) if leg in legs else name
         assert names[group.obs_index[1][k]] == expected
-        assert group.obs_sign[1][k] == (-1 if name.startswith(("V_x", "Acc_y")) else 1), name
+        turned = name.startswith(("V_x", "Acc_y", "Angle_x"))
+        assert group.obs_sign[1][k] == (-1 if turned else 1), name
     table = 1000 * action_table(any_config.task)
     np.testing.assert_allclose(table[group.action[1]], table * (-1, 1), atol=1e-6)
 
