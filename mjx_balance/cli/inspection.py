@@ -13,7 +13,7 @@ from mjx_balance.evaluation.suites import SUITES
 from mjx_balance.robots.catalogue import robot_notes
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline, scale_ranges
 from mjx_balance.robots.measure import UNLIMITED
-from mjx_balance.robots.robot import Leg
+from mjx_balance.robots.robot import Leg, gain_text
 from mjx_balance.sim.scene import ROBOT, Scene, load_scene
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
@@ -113,7 +113,8 @@ def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
     return [
         f"{name}: {robot.total_mass:.2f} kg, of which the trunk {robot.trunk_mass:.2f}",
         f"stands at {_mm(task.body_height)}; its legs reach from {_mm(low)} to {_mm(high)}",
-        f"servos {robot.servo_stiffness:g} N m/rad, {robot.servo_damping:g} N m s/rad; limits "
+        f"servos {gain_text(robot.servo_stiffness)} N m/rad, {gain_text(robot.servo_damping)} N m "
+        f"s/rad; limits "
         f"{_limit(robot.hip_torque)} (abduction, hip), {_limit(robot.knee_torque)} (knee){late}",
         "",
         *map(_leg, robot.legs),

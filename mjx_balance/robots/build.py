@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_balance.robots.measure import check_joints, measure, pose
 from mjx_balance.robots.model import FRESH, Coupling, compile_model, model_path, naming, read_model
-from mjx_balance.robots.robot import Robot
+from mjx_balance.robots.robot import Robot, per_joint
 from mjx_balance.robots.schema import FixedJoint, Foot, LegFile, RobotError, RobotFile
 from mjx_balance.text import MESSAGE, quote, shorten
 
@@ -456,15 +456,17 @@ def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
     for body in spec.bodies:
         body.gravcomp = 0
     for joint in spec.joints:
-        driven = joint.type != mujoco.mjtJoint.mjJNT_FREE
-        joint.damping = [robot.servo_damping * driven, 0, 0]
-        joint.armature = robot.servo_armature * driven
+        joint.damping, joint.armature = [0, 0, 0], 0
         joint.stiffness, joint.frictionloss = [0, 0, 0], 0
         joint.springdamper, joint.actgravcomp = [0, 0], False
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    torques = (robot.hip_torque, robot.hip_torque, robot.knee_torque)
+    fields = (robot.servo_stiffness, robot.servo_damping, robot.servo_armature)
+    numbers = [*zip(torques, *map(per_joint, fields), strict=True)]
     for leg in robot.legs:
-        torques = (robot.hip_torque, robot.hip_torque, robot.knee_torque)
-        for name, torque in zip(leg.joints, torques, strict=True):
+        for name, (torque, stiffness, damping, armature) in zip(leg.joints, numbers, strict=True):
+            joint = spec.joint(name)
+            joint.damping, joint.armature = [damping, 0, 0], armature
             servo = spec.add_actuator(
                 FRESH.default,
                 name=name,
@@ -473,7 +475,7 @@ def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
                 forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
                 forcerange=[-torque, torque],
             )
-            servo.set_to_position(kp=robot.servo_stiffness)
+            servo.set_to_position(kp=stiffness)
     for name, kind in (
         (GYRO, mujoco.mjtSensor.mjSENS_GYRO),
         (ACCELEROMETER, mujoco.mjtSensor.mjSENS_ACCELEROMETER),

@@ -11,6 +11,7 @@ from mjx_balance.files.validation import STRICT
 
 MOST = 1e7  #: bound of a robot's numbers, in their units
 Number = Annotated[float, Ge(-MOST), Le(MOST)]
+Gain = Number | tuple[Number, Number, Number]  #: of all servos, or of abduction, hip and knee
 Length = Annotated[float, Gt(0), Le(MOST)]
 Delay = Annotated[float, Ge(0), Le(10)]
 Turn = Annotated[float, Ge(-16), Le(16)]  #: rad; two and a half turns are 15.7
@@ -114,10 +115,21 @@ class Robot(Body):
 
     hip_torque: Number  #: limit of the abduction and hip servos, N m
     knee_torque: Number  #: limit of the knee servos, N m
-    servo_stiffness: Number  #: position gain of the leg servos, N m / rad
-    servo_damping: Number  #: damping of the leg joints, N m s / rad
-    servo_armature: Number  #: inertia of rotor and gear at the joint, kg m^2
+    servo_stiffness: Gain  #: position gain of the leg servos, N m / rad
+    servo_damping: Gain  #: damping of the leg joints, N m s / rad
+    servo_armature: Gain  #: inertia of rotor and gear at the joint, kg m^2
     foot_friction: Number  #: sliding friction of a foot on the board
     body_height: Number  #: standing height of the trunk's origin, foot radius included, m
     action_max: Number  #: greatest height change of one decision on one axis, m
     command_delay: Delay = 0.0  #: time until the servos obey a command, s
+
+
+def per_joint(gain: Gain) -> np.ndarray:
+    """A gain of abduction, hip and knee, (3,)."""
+    return np.broadcast_to(gain, 3)
+
+
+def gain_text(gain: Gain) -> str:
+    """A gain as text; three if abduction, hip and knee differ."""
+    values = per_joint(gain).tolist()
+    return "/".join(f"{x:g}" for x in (values if len(set(values)) > 1 else values[:1]))

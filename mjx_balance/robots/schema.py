@@ -16,6 +16,8 @@ from mjx_balance.text import MESSAGE, printable, quote, shorten
 MAX_FILE = 2**20  #: greatest size of a robot file, bytes
 Name = Annotated[str, MinLen(1)]
 Positive = Annotated[float, Gt(0), Le(MOST)]
+Gain = Positive | tuple[Positive, Positive, Positive]
+"""Of all servos, or of those of abductions, hips and knees."""
 Place = tuple[Number, Number, Number]  #: x, y and z, m
 
 
@@ -81,19 +83,23 @@ class RobotFile:
     """Torque limit of the abduction and hip servos, N m; none: from the model's actuators."""
     knee_torque: Positive | None = None
     """Torque limit of the knee servos, N m; none: from the model's actuators."""
-    servo_stiffness: Positive | None = None
+    servo_stiffness: Gain | None = None
     """N m / rad; none, also of the next five: from the robot's mass and size."""
-    servo_damping: Positive | None = None  #: N m s / rad
-    servo_armature: Positive | None = None  #: inertia of rotor and gear at the joint, kg m^2
-    command_delay: Delay = 0.0  #: time until the servos obey a command, s
+    servo_damping: Gain | None = None  #: N m s / rad
+    servo_armature: Gain | None = None  #: inertia of rotor and gear at the joint, kg m^2
     body_height: Positive | None = None  #: standing height of the trunk's origin above the board, m
     action_max: Positive | None = None  #: greatest height change of one decision on one axis, m
     board_size: Positive | None = None  #: length of the board in training, m
+    command_delay: Delay = 0.0  #: time until the servos obey a command, s
     source: str = ""  #: where the model is from
     license: str = ""  #: of the model
 
 
+_GAIN = "be a number greater than 0, or three: of abductions, hips and knees"
 REMEDIES = {
+    "servo_stiffness": _GAIN,
+    "servo_damping": _GAIN,
+    "servo_armature": _GAIN,
     "model": "be a name",
     "trunk": "be a name",
     "legs": "be four tables, as [legs.FL]",

@@ -16,6 +16,7 @@ from mjx_balance.robots.catalogue import Robot, find_robot, robot_file, robot_sp
 from mjx_balance.robots.limits import check_robot
 from mjx_balance.robots.measure import OUR_LEG, OUR_STIFFNESS
 from mjx_balance.robots.model import scene_dir
+from mjx_balance.robots.robot import gain_text, per_joint
 from mjx_balance.task import Array
 from mjx_balance.task.kinematics import joint_angles
 from mjx_balance.task.step import Targets
@@ -213,7 +214,7 @@ def _settle(layout: Layout) -> Stance:
     """
     data, trim = _rest(layout, np.ones((len(layout.leg_ctrl), 3)))
     if not (_is_still(layout, data) and _is_at_targets(layout, data)):
-        data, trim = _rest(layout, np.maximum(_stiffness(layout.robot) / _gains(layout), 1))
+        data, trim = _rest(layout, np.maximum(_too_soft_by(layout), 1))
         if not _endures(layout, data):
             raise ConfigError(_why_unsettled(layout, data))
     state = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
@@ -254,11 +255,6 @@ def _standing_angles(layout: Layout) -> Float[np.ndarray, "legs 3"]:
     return joint_angles(layout.robot, heights)
 
 
-def _gains(layout: Layout) -> Float[np.ndarray, "legs 3"]:
-    """Stiffness of the servos, N m / rad."""
-    return layout.model.actuator_gainprm[layout.leg_ctrl, 0]
-
-
 def _with_gains(layout: Layout, factor: float | np.ndarray) -> mujoco.MjModel:
     """The model with servos so many times as stiff."""
     model, servos = copy.copy(layout.model), layout.leg_ctrl
@@ -267,9 +263,10 @@ def _with_gains(layout: Layout, factor: float | np.ndarray) -> mujoco.MjModel:
     return model
 
 
-def _stiffness(robot: Robot) -> float:
-    """Stiffness like our own robot's, relative to weight times leg length, N m / rad."""
-    return OUR_STIFFNESS * robot.mass_scale * robot.leg_length / OUR_LEG
+def _too_soft_by(layout: Layout) -> Float[np.ndarray, "legs 3"]:
+    """Factor to the stiffness of our own robot's servos, relative to weight times leg length."""
+    stiff = OUR_STIFFNESS * layout.robot.mass_scale * layout.robot.leg_length / OUR_LEG
+    return stiff / layout.model.actuator_gainprm[layout.leg_ctrl, 0]
 
 
 def _is_still(layout: Layout, data: mujoco.MjData) -> bool:
@@ -305,7 +302,7 @@ def _why_unsettled(layout: Layout, data: mujoco.MjData) -> str:
         )
     return (
         f"robot {robot.name} does not stand still at body_height {height} m with "
-        f"servo_stiffness {robot.servo_stiffness:g} N m/rad: "
+        f"servo_stiffness {gain_text(robot.servo_stiffness)} N m/rad: "
         f"{_why_unbalanced(layout) or _why_too_soft(layout) or _what_to_leave_out(layout)}"
     )
 
@@ -329,12 +326,11 @@ def _why_unbalanced(layout: Layout) -> str:
 
 def _why_too_soft(layout: Layout) -> str:
     """The least stiffness with which the robot stands, if it does with stiff servos."""
-    most = float(np.max(_stiffness(layout.robot) / _gains(layout)))
+    most = float(_too_soft_by(layout).max())
 
     def stands(factor: float) -> bool:
-        model = _with_gains(layout, factor)
-        stiffer = dataclasses.replace(layout, model=model)
-        data, _ = _rest(stiffer, np.full((len(layout.leg_ctrl), 3), most / factor))
+        stiffer = dataclasses.replace(layout, model=_with_gains(layout, factor))
+        data, _ = _rest(stiffer, np.maximum(_too_soft_by(stiffer), 1))
         return _endures(stiffer, data)
 
     if most <= 1 or not stands(most):
@@ -343,10 +339,10 @@ def _why_too_soft(layout: Layout) -> str:
     while high / low > LEAST_STEP:
         middle = math.sqrt(low * high)
         low, high = (low, middle) if stands(middle) else (middle, high)
-    least = high * layout.robot.servo_stiffness
-    digit = 10.0 ** (math.floor(math.log10(least)) - 1)
-    least = digit * math.ceil(least / digit)
-    return f"its weight bends them ever further; servo_stiffness must be at least {least:g}"
+    least = high * per_joint(layout.robot.servo_stiffness)
+    digits = 10.0 ** (np.floor(np.log10(least)) - 1)
+    text = gain_text(tuple(digits * np.ceil(least / digits)))
+    return f"its weight bends them ever further; servo_stiffness must be at least {text}"
 
 
 def _what_to_leave_out(layout: Layout) -> str:

@@ -238,8 +238,8 @@ def test_small_robots_do_not_sag(size: float, stiffness: float, tmp_path: Path) 
     """
     robot = find_robot(bodies.write_robot(tmp_path, bodies.scaled(bodies.our_spec(), size)))
     assert robot.servo_stiffness == pytest.approx(stiffness, rel=0.01)
-    assert robot.servo_damping / robot.servo_stiffness == pytest.approx(16 / 400, rel=0.01)
-    assert robot.servo_armature / robot.servo_stiffness == pytest.approx(0.02 / 400, rel=0.01)
+    assert robot.servo_damping == pytest.approx(16 / 400 * stiffness, rel=0.015)
+    assert robot.servo_armature == pytest.approx(0.02 / 400 * stiffness, rel=0.015)
 
 
 @pytest.mark.parametrize(("x", "stiffness"), [("0.1", 400 * 1.42**2), ("0.04", 400 * 3.55**2)])
@@ -311,6 +311,21 @@ def test_a_files_own_numbers_win(tmp_path: Path) -> None:
     assert model.geom(f"{ROBOT}{robot.legs[0].foot}").size[0] == 0.03
     assert model.site(f"{ROBOT}balance_imu").pos.tolist() == [0.1, 0.02, 0.03]
     assert model.pair_friction[0, 0] == 0.6
+
+
+def test_gains_of_abduction_hip_and_knee_may_differ(tmp_path: Path) -> None:
+    gains = {"stiffness": [60.0, 50.0, 80.0], "damping": [5.0, 4.0, 7.0]}
+    gains["armature"] = [0.1, 0.2, 0.3]
+    fields: dict[str, Any] = {f"servo_{name}": f"{values}" for name, values in gains.items()}
+    scene = scene_of(bodies.write_robot(tmp_path, **fields))
+    for joints in (leg.joints for leg in scene.robot.legs):
+        servos = [scene.model.actuator(f"{ROBOT}{joint}") for joint in joints]
+        moving = [scene.model.joint(f"{ROBOT}{joint}") for joint in joints]
+        assert [x.gainprm[0] for x in servos] == gains["stiffness"]
+        assert [-x.biasprm[1] for x in servos] == gains["stiffness"]
+        assert [x.damping[0] for x in moving] == gains["damping"]
+        assert [x.armature[0] for x in moving] == gains["armature"]
+    assert from_dict(Robot, json.loads(json.dumps(dataclasses.asdict(scene.robot)))) == scene.robot
 
 
 INERTIAL = '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>'

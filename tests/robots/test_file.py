@@ -77,6 +77,11 @@ def test_a_joint_is_fixed_somewhere(tmp_path: Path) -> None:
         ('"c0"', '"b0"', "joint 'b0' is in leg B and in leg C"),
         ("-0.2]", "]", r"foot of leg B is .*\[0, 0\]}; it must be a geom, site or body, or"),
         ('body = "b", ', "", "foot of leg B is {'offset'.*; it must be a geom, site or body"),
+        (
+            "= 30",
+            "= 30\nservo_damping = [1.0, 2.0]",
+            r"servo_damping is \[1.0, 2.0\]; it must be a number .*, or three: of abductions, hips",
+        ),
         ("[0.1, 0, -0.02]", "true", "imu is True; it must be a site, or a place"),
         ("[0.1, 0, -0.02]", "[0.1, 0, nan]", r"imu is \[0.1, 0, nan\]; it must be a site, or a"),
         ('["head"]', '"head"', "strip is 'head'; it must list bodies and joints"),
