@@ -23,7 +23,7 @@ from common import REPO, Row
 from mjx_balance.evaluation.controllers import make_controller
 from mjx_balance.evaluation.rollout import observing, policy_scene
 from mjx_balance.policy.file import load_policy
-from mjx_balance.robots.catalogue import shipped
+from mjx_balance.robots.catalogue import makers
 
 SUITES = {"paper": 1, "corner": 1, "push": 4}
 """Suite -> what `--scenarios` is divided by."""
@@ -72,7 +72,7 @@ def robot_row(robot: str, path: Path, scenarios: int) -> Row:
 def main() -> None:
     """Trains, measures and prints."""
     parser = common.arguments(__doc__)
-    parser.add_argument("--robots", nargs="+", default=[x for x in shipped() if x != "quadruped"])
+    parser.add_argument("--robots", nargs="+", default=makers())
     parser.add_argument("--policies", type=Path, default=REPO / "policies" / "robots")
     parser.add_argument("--preset", default="best")
     parser.add_argument("--scenarios", type=int, default=256, help="a quarter of it in push")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mjx_balance.robots.catalogue import shipped
+from mjx_balance.robots.catalogue import makers, shipped
 
 pytestmark = pytest.mark.slow
 
@@ -40,8 +40,7 @@ def test_what_is_in_it(wheel: Path) -> None:
     expected = {"py.typed", "runtime.py", "policies/best.safetensors", "report/page.html"}
     expected |= {f"scenes/{name}.xml" for name in ("board", "quadruped", "scene")}
     expected |= {f"robots/{name}.toml" for name in shipped()}
-    makers = set(shipped()) - {"quadruped"}
-    expected |= {f"policies/robots/{name}.safetensors" for name in makers}
+    expected |= {f"policies/robots/{name}.safetensors" for name in makers()}
     expected = {f"mjx_balance/{name}" for name in expected}
     assert expected <= names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "docs/"))]

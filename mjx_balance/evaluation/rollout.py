@@ -20,7 +20,7 @@ from mjx_balance.evaluation.suites import SUITES, draw_suite
 from mjx_balance.machine import available_memory
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.robots.catalogue import RobotError, find_robot, shipped
-from mjx_balance.sim.scene import Scene, load_scene
+from mjx_balance.sim.scene import Scene, load_scene, soften
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.reward import failed
 from mjx_balance.task.step import Outcome
@@ -215,12 +215,12 @@ def policy_scene(policy: Policy, robot: str | None = None) -> Scene:
 
 
 def suite_scene(scene: Scene, suite: str) -> Scene:
-    """The scene in which a suite runs: this one, with a platform if the suite moves one."""
+    """The scene in which a suite runs: this one, or one with a platform or soft servos."""
     chosen = SUITES.get(suite)
-    if scene.task.platform or chosen is None or not chosen.platform:
-        return scene
-    task = dataclasses.replace(scene.task, platform=True)
-    return load_scene(Config(robot=scene.robot_source, task=task))
+    if chosen is not None and chosen.platform and not scene.task.platform:
+        task = dataclasses.replace(scene.task, platform=True)
+        return load_scene(Config(robot=scene.robot_source, task=task))
+    return soften(scene) if chosen is not None and chosen.soft else scene
 
 
 def evaluate(

@@ -39,6 +39,7 @@ class Suite:
     """(n,) inclines in deg, (n, k, 2) uniform numbers -> (n, k, 2) targets in deg, of ramps."""
     motion: str | None = None  #: kind of board motion (`tilt.MOTIONS`) instead of ramps
     platform: bool = False  #: whether the platform of `TaskConfig.platform` moves
+    soft: bool = False  #: whether the robot stands on soft servos (`sim.scene.soften`)
     fast: bool = False  #: board speeds uniform from the config's to the authority limit
     steep: bool = False  #: inclines uniform from the config's to the reach of the legs
 
@@ -50,6 +51,7 @@ SUITES: dict[str, Suite] = {
     "payload": Suite(RandomizationConfig(payload=5.0)),  # 0 to 5 kg on the trunk, off its centre
     "friction": Suite(RandomizationConfig(friction_min=0.4, friction_max=1.0)),
     "gains": Suite(RandomizationConfig(gain_spread=0.2)),  # servo gains off by up to 20%
+    "soft": Suite(soft=True),  # servos as soft as public controllers command
     "latency": Suite(RandomizationConfig(latency_share=1.0)),  # every action one decision late
     "push": Suite(RandomizationConfig(push_min=0.2, push_max=0.4)),  # any direction, every 5 s
     "fast": Suite(fast=True),

@@ -13,12 +13,18 @@ from mjx_balance.robots.schema import RobotError, RobotFile, parse_robot_file, r
 from mjx_balance.text import quote
 
 SHIPPED = Path(__file__).resolve().parent
+OURS = ("quadruped", "quadruped_soft")
 MENAGERIE = "menagerie:"
 
 
 def shipped() -> list[str]:
     """Returns the names of the robots whose files are part of this package."""
     return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+
+
+def makers() -> list[str]:
+    """Returns those of them that other makers make."""
+    return [name for name in shipped() if name not in OURS]
 
 
 def robot_file(name: str) -> RobotFile:

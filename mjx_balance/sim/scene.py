@@ -206,6 +206,31 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     return Scene(**vars(layout), stance=_settle(layout))
 
 
+def soften(scene: Scene) -> Scene:
+    """The scene with servos as soft as those of `quadruped_soft`.
+
+    Stiffness and damping are its own times weight and leg length relative to ours; servos that are
+    softer already stay as they are.
+
+    Raises:
+      ConfigError: if the robot does not stand.
+    """
+    model, servos = copy.copy(scene.model), scene.leg_ctrl
+    soft, scale = find_robot("quadruped_soft"), _weight_scale(scene.robot)
+    stiffness, damping = (
+        np.minimum(per_joint(getattr(scene.robot, name)), scale * getattr(soft, name))
+        for name in ("servo_stiffness", "servo_damping")
+    )
+    model.actuator_gainprm[servos, 0] = stiffness
+    model.actuator_biasprm[servos, 1] = -stiffness
+    model.dof_damping[_leg_dofs(model, servos)] = damping
+    robot = dataclasses.replace(
+        scene.robot, servo_stiffness=tuple(stiffness), servo_damping=tuple(damping)
+    )
+    softer = dataclasses.replace(scene, model=model, robot=robot)
+    return dataclasses.replace(softer, stance=_settle(softer))
+
+
 def _settle(layout: Layout) -> Stance:
     """Lets the robot come to rest on the level board with its joints at their targets.
 
@@ -237,7 +262,7 @@ def _rest(
     data.qpos[root : root + 7] = (0, 0, height, 1, 0, 0, 0)
     data.qpos[legs] = angles
     stiff = _with_gains(layout, stiffer)
-    stiff.dof_damping[model.jnt_dofadr[model.actuator_trnid[servos, 0]]] *= stiffer
+    stiff.dof_damping[_leg_dofs(model, servos)] *= stiffer
     for _ in range(SETTLE_ROUNDS):
         data.ctrl[servos] = angles + trim
         mujoco.mj_step(stiff, data, nstep=SETTLE_STEPS)
@@ -263,10 +288,23 @@ def _with_gains(layout: Layout, factor: float | np.ndarray) -> mujoco.MjModel:
     return model
 
 
+def _weight_scale(robot: Robot) -> float:
+    """Weight times leg length, relative to our own robot's."""
+    return robot.mass_scale * robot.leg_length / OUR_LEG
+
+
+def _leg_dofs(model: mujoco.MjModel, servos: Int[np.ndarray, "legs 3"]) -> np.ndarray:
+    """Addresses in qvel of the joints that the servos move."""
+    return model.jnt_dofadr[model.actuator_trnid[servos, 0]]
+
+
 def _too_soft_by(layout: Layout) -> Float[np.ndarray, "legs 3"]:
     """Factor to the stiffness of our own robot's servos, relative to weight times leg length."""
-    stiff = OUR_STIFFNESS * layout.robot.mass_scale * layout.robot.leg_length / OUR_LEG
-    return stiff / layout.model.actuator_gainprm[layout.leg_ctrl, 0]
+    return (
+        OUR_STIFFNESS
+        * _weight_scale(layout.robot)
+        / layout.model.actuator_gainprm[layout.leg_ctrl, 0]
+    )
 
 
 def _is_still(layout: Layout, data: mujoco.MjData) -> bool:

@@ -1,6 +1,7 @@
 """Suites are what they say, and their scenarios depend on nothing but the seed."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ from mjx_balance.envs.batch import Episodes, rows
 from mjx_balance.evaluation.controllers import View, make_controller
 from mjx_balance.evaluation.rollout import roll_out, run_suite, suite_scene
 from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite
-from mjx_balance.robots.catalogue import Robot, find_robot
+from mjx_balance.robots.catalogue import SHIPPED, Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.randomization import DRAWS, draw_params
@@ -228,12 +229,35 @@ def test_baselines_run_on_a_platform(config: Config) -> None:
         assert rollout.tilt.mean() < 0.1
 
 
+def test_soft_is_the_scene_of_our_soft_robot(config: Config) -> None:
+    soft = suite_scene(load_scene(config), "soft")
+    expected = load_scene(dataclasses.replace(config, robot="quadruped_soft"))
+    assert soft.hash == expected.hash
+    np.testing.assert_allclose(soft.stance.leg_trim, expected.stance.leg_trim, atol=1e-9)
+    again = suite_scene(soft, "soft")
+    assert again.hash == soft.hash, "soft servos stay as they are"
+
+
+def test_soft_goes_with_weight_and_leg(tmp_path: Path) -> None:
+    """B2 has 5.493 times our weight and 0.7 / 0.426 times our leg; 10 N m s / rad is softer."""
+    text = (SHIPPED / "b2.toml").read_text()
+    (tmp_path / "b2.toml").write_text(f"servo_damping = 10.0\n{text}")
+    scene = load_scene(for_robot(preset("default"), str(tmp_path / "b2.toml")))
+    model = suite_scene(scene, "soft").model
+    stiffness = 60 * 5.493 * 0.7 / 0.426
+    gains = model.actuator_gainprm[scene.leg_ctrl, 0]
+    np.testing.assert_allclose(gains, stiffness, rtol=1e-3)
+    np.testing.assert_array_equal(model.actuator_biasprm[scene.leg_ctrl, 1], -gains)
+    joints = model.actuator_trnid[scene.leg_ctrl, 0]
+    np.testing.assert_array_equal(model.dof_damping[model.jnt_dofadr[joints]], 10.0)
+
+
 def test_impossible_wishes_are_refused(config: Config) -> None:
     with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
         draw(config, "paper", 1, 10, -1)
     names = (
-        "paper, corner, noise, payload, friction, gains, latency, push, fast, steep, steps, sea, "
-        "platform"
+        "paper, corner, noise, payload, friction, gains, soft, latency, push, fast, steep, steps, "
+        "sea, platform"
     )
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
         draw(config, "moon", 1, 10, 0)

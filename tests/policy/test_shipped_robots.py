@@ -6,9 +6,9 @@ from mjx_balance.evaluation.controllers import make_controller
 from mjx_balance.evaluation.rollout import evaluate, observing, policy_scene, run_suite
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.policy.file import load_policy, shipped_policies
-from mjx_balance.robots.catalogue import shipped
+from mjx_balance.robots.catalogue import makers
 
-MAKERS = tuple(name for name in shipped() if name != "quadruped")
+MAKERS = tuple(makers())
 
 
 def test_each_robot_has_one() -> None:

