@@ -263,6 +263,7 @@ def _rest(
     data.qpos[legs] = angles
     stiff = _with_gains(layout, stiffer)
     stiff.dof_damping[_leg_dofs(model, servos)] *= stiffer
+    stiff.dof_armature[_leg_dofs(model, servos)] *= stiffer  # or they would be too fast for a step
     for _ in range(SETTLE_ROUNDS):
         data.ctrl[servos] = angles + trim
         mujoco.mj_step(stiff, data, nstep=SETTLE_STEPS)
