@@ -56,30 +56,38 @@ class BatchEnv:
     """n envs of one scene. `step` resets none of them."""
 
     def __init__(self, scene: Scene, episodes: Episodes, threads: int | None = None):
-        """Starts all envs, robots settled on level boards, with worker threads; None: all cores."""
+        """Starts all envs, robots settled on their boards, with worker threads; None: all cores."""
         self.scene, self.task = scene, scene.task
         self.num_envs = len(episodes.scenario.phase)
         self._engine = MujocoEngine(scene, self.num_envs, threads)
         self.state = self._initial(np.arange(self.num_envs), episodes)
         self._rngs = list(episodes.rngs)
-        angles = np.tile(scene.stance.qpos[scene.leg_qpos], (self.num_envs, 1, 1))
-        self.initial_obs = observation(self.task, scene.robot, self.state.memory, angles)
-        """(n, obs_size) of robots that have just been reset."""
+        self.initial_obs = self._observe_start(self.state)
+        """(n, obs_size) at the start of the episodes."""
 
     def reset(self, ids: Int[np.ndarray, " k"], episodes: Episodes) -> None:
         """Starts envs `ids` anew; episodes have params and pushes if the first ones had."""
-        _set_rows(self.state, ids, self._initial(ids, episodes))
-        self._engine.reset(ids)
+        start = self._initial(ids, episodes)
+        _set_rows(self.state, ids, start)
+        self.initial_obs[ids] = self._observe_start(start)
         for k, rng in zip(ids, episodes.rngs, strict=True):
             self._rngs[k] = rng
 
     def _initial(self, ids: np.ndarray, episodes: Episodes) -> EnvState:
-        still = np.tile(self.scene.stance.imu, (len(ids), 1))
-        memory = initial_memory(self.task, self.scene.robot, still)
+        """The state in which envs `ids` start; puts the engine there."""
+        start, count = self.scene.start(episodes.scenario.start), len(ids)
+        still, tilt = np.broadcast_to(start.imu, (count, 6)), np.broadcast_to(start.tilt, count)
+        self._engine.reset(ids, start.qpos)
+        memory = initial_memory(self.task, self.scene.robot, still, tilt)
         env_steps = np.zeros(len(ids), int)
         params, pushes = episodes.params, episodes.pushes
         state = EnvState(ids, memory, episodes.scenario, env_steps, params, pushes)
         return _tree_map(np.array, state)  # a copy, which may be written to
+
+    def _observe_start(self, state: EnvState) -> np.ndarray:
+        angles = self.scene.stance.qpos[self.scene.leg_qpos]
+        angles = np.tile(angles, (len(state.env_steps), 1, 1))
+        return observation(self.task, self.scene.robot, state.memory, angles)
 
     def step(
         self, change: Float[np.ndarray, "k 2"], ids: Int[np.ndarray, " k"] | None = None

@@ -103,7 +103,7 @@ def roll_out(
         seconds=0.0,
     )
     ids, obs = np.arange(count), env.initial_obs
-    imu = np.tile(scene.stance.imu, (count, task.sim_steps, 1))
+    imu = np.repeat(env.state.memory.imu[:, -1:], task.sim_steps, axis=1)
     table, began = action_table(task), time.perf_counter()
     for number in range(decisions):
         action = controller(look(env, ids, number, obs, imu))

@@ -126,8 +126,20 @@ def step(
     return state, outcome
 
 
-def initial_memory(task: TaskConfig, robot: Robot, still: Float[Array, "*batch 6"]) -> Memory:
-    """The memory of a robot that has been standing for a while, with IMU samples `still`."""
+def initial_memory(
+    task: TaskConfig,
+    robot: Robot,
+    still: Float[Array, "*batch 6"],
+    tilt: Float[Array, "*batch"] | None = None,
+) -> Memory:
+    """The memory of a robot that has been standing for a while.
+
+    Args:
+      task: the observation.
+      robot: the same.
+      still: IMU samples, rad/s and m/s^2.
+      tilt: of the body, deg; None: level.
+    """
     xp, rows = still.__array_namespace__(), input_rows(task, robot)
     heights = xp.full((*still.shape[:-1], len(robot.legs)), task.body_height, still.dtype)
     means = mean_rows(rows)
@@ -135,7 +147,7 @@ def initial_memory(task: TaskConfig, robot: Robot, still: Float[Array, "*batch 6
         heights=heights,
         commanded=xp.repeat(heights[..., None, :], lookback(rows, "commands"), axis=-2),
         imu=xp.repeat(still[..., None, :], lookback(rows, "imu"), axis=-2),
-        tilt=xp.zeros_like(still[..., 0]),
+        tilt=xp.zeros_like(still[..., 0]) if tilt is None else tilt,
         means=start_means(means, task.sim_dt, still) if means else None,
     )
 
