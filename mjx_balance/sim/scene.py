@@ -110,7 +110,7 @@ class Scene(Layout):
         cosines, sines = xp.cos(angle / 2), xp.sin(angle / 2)
         about_x = [cosines[..., 0], sines[..., 0], 0, 0]
         about_y = [cosines[..., 1], 0, sines[..., 1], 0]
-        turned = _times(_times(about_x, about_y), stance.qpos[self.trunk_quat])
+        turned = _times(_times(about_x, about_y), stance.qpos[self.trunk_quat].tolist())
         qpos[root + 3 : root + 7] = turned
         x, y, z = stance.imu[3:]
         y, z = ca * y + sa * z, ca * z - sa * y
