@@ -90,7 +90,7 @@ class Session:
         self.suite_pushes = episodes.pushes or Pushes(np.zeros((1, 0, 2)), np.zeros((1, 0), int))
         self.env = BatchEnv(self.scene, episodes, threads=1)
         self.obs = self.env.initial_obs
-        self.imu = np.tile(self.scene.stance.imu, (1, self.task.sim_steps, 1))
+        self.imu = np.repeat(self.env.state.memory.imu[:, -1:], self.task.sim_steps, axis=1)
         self.target, self.board = np.zeros(2), np.zeros(2)
         self.push, self.number, self.tilt = np.zeros(2), 0, 0.0
 

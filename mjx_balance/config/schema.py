@@ -79,9 +79,6 @@ class TaskConfig:
     and sways by the same (chosen: a slight sea)."""
     sea_heading: Annotated[float, Ge(-360), Le(360)] | None = None
     """Mean direction in which the waves run, deg from straight ahead to the left; none: any."""
-    start_incline: Annotated[float, Ge(0), Lt(90)] = 0.0
-    """Greatest tilt of the board at the start of a training episode, and of the body that stands on
-    it, deg; in any direction (paper: it starts level)."""
     fail_tilt: Annotated[float, Gt(0), Lt(90)] = 6.0
     """Body tilt that counts as a fall, deg (paper 3.1)."""
     action_max: Positive = 0.003
@@ -165,6 +162,31 @@ class RandomizationConfig:
     """Standard deviation of every gyro sample, rad/s."""
     accel_noise: NonNegative = 0.0
     """Standard deviation of every accelerometer sample, m/s^2."""
+    gyro_bias: NonNegative = 0.0
+    """Greatest bias of the gyro on every axis, rad/s."""
+    gyro_bias_drift: NonNegative = 0.0
+    """Random walk of that bias, rad/s per square root of a second."""
+    accel_bias: NonNegative = 0.0
+    """Greatest bias of the accelerometer on every axis, m/s^2."""
+    accel_bias_drift: NonNegative = 0.0
+    """Random walk of that bias, m/s^2 per square root of a second."""
+    imu_scale: Annotated[float, Ge(0), Lt(1)] = 0.0
+    """Greatest relative error of the IMU's scale on every axis of gyro and accelerometer."""
+    imu_tilt: Annotated[float, Ge(0), Le(0.5)] = 0.0
+    """Greatest turn of the IMU against the trunk about every axis, rad."""
+    encoder_offset: NonNegative = 0.0
+    """Greatest error of every joint encoder, by which the servos go as well, rad."""
+    sensor_delay: NonNegative = 0.0
+    """Greatest age of the IMU's samples, the same throughout an episode, s."""
+    sensor_jitter: NonNegative = 0.0
+    """Greatest further age, new in every decision, s."""
+    command_delay: NonNegative = 0.0
+    """Greatest time until the legs begin to obey, the same throughout an episode, s; it adds to
+    that of the robot's file."""
+    command_jitter: NonNegative = 0.0
+    """Greatest further delay, new in every decision, s."""
+    dropout: Annotated[float, Ge(0), Lt(1)] = 0.0
+    """Share of the IMU's samples that are lost; the last one comes again instead."""
     payload: NonNegative = 0.0
     """Greatest mass carried on the trunk, kg."""
     payload_offset: NonNegative = 0.05
@@ -189,9 +211,17 @@ class RandomizationConfig:
     @property
     def varies(self) -> bool:
         """Whether envs differ; the payload's offset and height matter only with a payload."""
-        shares = self.gain_spread, self.latency_share
+        shares = self.gain_spread, self.latency_share, self.sensors_err
         sizes = self.gyro_noise, self.accel_noise, self.payload, self.push_max
         return any((*shares, *sizes)) or (self.friction_min, self.friction_max) != (None, None)
+
+    @property
+    def sensors_err(self) -> bool:
+        """Whether more is wrong with sensors or commands than noise and a decision's delay."""
+        biases = self.gyro_bias, self.gyro_bias_drift, self.accel_bias, self.accel_bias_drift
+        shapes = self.imu_scale, self.imu_tilt, self.encoder_offset, self.dropout
+        delays = self.sensor_delay, self.sensor_jitter, self.command_delay, self.command_jitter
+        return any((*biases, *shapes, *delays))
 
 
 @dataclasses.dataclass(frozen=True)

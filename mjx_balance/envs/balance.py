@@ -15,6 +15,7 @@ from mjx_balance.task.observation import input_rows
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, draw_params
 from mjx_balance.task.reward import reward_rows
+from mjx_balance.task.sensors import count_draws, draw_decision, draw_errors
 from mjx_balance.task.step import EnvState, initial_memory, observation, step
 from mjx_balance.task.symmetry import Symmetries, symmetries
 from mjx_balance.task.tilt import MOST_CALLS, draw_scenario
@@ -98,9 +99,9 @@ class BalanceEnv(Env):
     def reset(self, rng: jax.Array) -> State:
         """Starts a fresh tilt scenario from the settled stance, by a PRNG key."""
         task, robot, scene = self.config.task, self.scene.robot, self.scene
-        ranges, params, pushes = self.config.randomization, None, None
+        ranges, params, pushes, errors = self.config.randomization, None, None, None
         # No key depends on how many are split off: pushes change no other draw.
-        rng, key_params, key_noise, key_pushes = jax.random.split(rng, 4)
+        rng, key_params, key_noise, key_pushes, key_errors = jax.random.split(rng, 5)
         info = {
             "episode_length": jnp.int32(task.episode_length),
             "truncation": jnp.float32(0.0),
@@ -109,6 +110,9 @@ class BalanceEnv(Env):
             draws = jax.random.uniform(key_params, (DRAWS,), jnp.float32)
             params = draw_params(ranges, robot, draws)
             info["noise_key"] = key_noise
+        if ranges.sensors_err:
+            draws = jax.random.uniform(key_errors, (count_draws(robot),), jnp.float32)
+            errors = draw_errors(ranges, robot, draws)
         due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
         if len(due):
             draws = jax.random.uniform(key_pushes, (len(due), 2), jnp.float32)
@@ -118,17 +122,19 @@ class BalanceEnv(Env):
         def uniform(shape: tuple[int, ...], low: float, high: float) -> jax.Array:
             return jax.random.uniform(next(keys), shape, jnp.float32, low, high)
 
-        scenario = draw_scenario(task, uniform)
-        qpos, still, tilt = (jnp.asarray(x, jnp.float32) for x in scene.start(scenario.start))
+        still = jnp.asarray(scene.stance.imu, jnp.float32)
         start = EnvState(
-            physics=self.engine.initial(qpos),
-            memory=initial_memory(task, robot, still, tilt),
-            scenario=scenario,
+            physics=self.engine.initial(),
+            memory=initial_memory(task, robot, still, errors),
+            scenario=draw_scenario(task, uniform),
             env_steps=jnp.int32(0),
             params=params,
             pushes=pushes,
+            errors=errors,
         )
         angles = start.physics.qpos[scene.leg_qpos]
+        if errors is not None:
+            angles = angles + errors.encoders
         obs = observation(task, robot, start.memory, angles)
         zero = jnp.float32(0.0)
         rewards = [f"reward_{row.name}" for row in reward_rows(task)]
@@ -150,17 +156,23 @@ class BalanceEnv(Env):
 
         `action` is an index, 0 to action_size - 1, or two shares, clipped to -1 to 1.
         """
-        task, info, noise = self.config.task, state.info, None
-        if "noise_key" in info:
-            key, key_noise = jax.random.split(info["noise_key"])
-            noise = jax.random.normal(key_noise, (task.sim_steps, 6), jnp.float32)
-            info = info | {"noise_key": key}
+        task, info, draws = self.config.task, state.info, None
         before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+        if "noise_key" in info:
+            key, *own = jax.random.split(info["noise_key"], 2 if before.errors is None else 4)
+            keys = iter(own)
+            draws = draw_decision(
+                task,
+                before.errors,
+                lambda shape: jax.random.normal(next(keys), shape, jnp.float32),
+                lambda shape: jax.random.uniform(next(keys), shape, jnp.float32),
+            )
+            info = info | {"noise_key": key}
         if self._discrete:
             change = jnp.asarray(self._table, jnp.float32)[action]
         else:
             change = task.action_max * jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
-        after, outcome = step(task, self.scene.robot, self.engine, before, change, noise)
+        after, outcome = step(task, self.scene.robot, self.engine, before, change, draws)
         truncated = ~outcome.terminated & (after.env_steps >= info["episode_length"])
         metrics = {
             "tilt_deg": outcome.tilt.mean(),

@@ -12,6 +12,7 @@ from mjx_balance.sim.engines.mujoco import MujocoEngine
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
+from mjx_balance.task.sensors import SensorErrors, count_draws, draw_decision, draw_errors
 from mjx_balance.task.step import EnvState, Outcome, initial_memory, observation, step
 from mjx_balance.task.tilt import Scenario, draw_scenario, numpy_uniform
 
@@ -24,7 +25,8 @@ class Episodes(NamedTuple):
     scenario: Scenario  #: where the boards go
     params: DomainParams | None = None  #: None: nominal
     pushes: Pushes | None = None  #: None: no pushes
-    rngs: Sequence[np.random.Generator] = ()  #: of each episode, for its sensor noise
+    rngs: Sequence[np.random.Generator] = ()  #: of each episode, for its sensors
+    errors: SensorErrors | None = None  #: None: sensors are right, but for noise
 
 
 def draw_episodes(
@@ -39,54 +41,57 @@ def draw_episodes(
       task: of the scenarios.
       ranges: of domain parameters and pushes.
       robot: the nominal friction.
-      rngs: of each episode; its sensor noise comes from it, too.
+      rngs: of each episode; the noise of its sensors comes from it, too.
     """
     due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
-    params, pushes = None, None
+    params, pushes, errors = None, None, None
     scenarios = [draw_scenario(task, numpy_uniform(rng)) for rng in rngs]
     if ranges.varies:
         params = draw_params(ranges, robot, np.stack([rng.uniform(size=DRAWS) for rng in rngs]))
     if len(due):
         uniform = np.stack([rng.uniform(size=(len(due), 2)) for rng in rngs])
         pushes = Pushes(draw_velocity(ranges, uniform), np.tile(due, (len(rngs), 1)))
-    return Episodes(stacked(scenarios), params, pushes, rngs)
+    if ranges.sensors_err:
+        count = count_draws(robot)
+        errors = draw_errors(ranges, robot, np.stack([rng.uniform(size=count) for rng in rngs]))
+    return Episodes(stacked(scenarios), params, pushes, rngs, errors)
 
 
 class BatchEnv:
     """n envs of one scene. `step` resets none of them."""
 
     def __init__(self, scene: Scene, episodes: Episodes, threads: int | None = None):
-        """Starts all envs, robots settled on their boards, with worker threads; None: all cores."""
+        """Starts all envs, robots settled on level boards, with worker threads; None: all cores."""
         self.scene, self.task = scene, scene.task
         self.num_envs = len(episodes.scenario.phase)
         self._engine = MujocoEngine(scene, self.num_envs, threads)
         self.state = self._initial(np.arange(self.num_envs), episodes)
         self._rngs = list(episodes.rngs)
-        self.initial_obs = self._observe_start(self.state)
-        """(n, obs_size) at the start of the episodes."""
+        self.initial_obs = self._first_obs(self.state)
+        """(n, obs_size) of the robots when they were last reset."""
 
     def reset(self, ids: Int[np.ndarray, " k"], episodes: Episodes) -> None:
-        """Starts envs `ids` anew; episodes have params and pushes if the first ones had."""
-        start = self._initial(ids, episodes)
-        _set_rows(self.state, ids, start)
-        self.initial_obs[ids] = self._observe_start(start)
+        """Starts envs `ids` anew; episodes have what may be None if the first ones had it."""
+        state = self._initial(ids, episodes)
+        _set_rows(self.state, ids, state)
+        self.initial_obs[ids] = self._first_obs(state)
+        self._engine.reset(ids)
         for k, rng in zip(ids, episodes.rngs, strict=True):
             self._rngs[k] = rng
 
     def _initial(self, ids: np.ndarray, episodes: Episodes) -> EnvState:
-        """The state in which envs `ids` start; puts the engine there."""
-        start, count = self.scene.start(episodes.scenario.start), len(ids)
-        still, tilt = np.broadcast_to(start.imu, (count, 6)), np.broadcast_to(start.tilt, count)
-        self._engine.reset(ids, start.qpos)
-        memory = initial_memory(self.task, self.scene.robot, still, tilt)
+        still = np.tile(self.scene.stance.imu, (len(ids), 1))
+        memory = initial_memory(self.task, self.scene.robot, still, episodes.errors)
         env_steps = np.zeros(len(ids), int)
-        params, pushes = episodes.params, episodes.pushes
-        state = EnvState(ids, memory, episodes.scenario, env_steps, params, pushes)
+        scenario, params, pushes, _, errors = episodes
+        state = EnvState(ids, memory, scenario, env_steps, params, pushes, errors)
         return _tree_map(np.array, state)  # a copy, which may be written to
 
-    def _observe_start(self, state: EnvState) -> np.ndarray:
-        angles = self.scene.stance.qpos[self.scene.leg_qpos]
-        angles = np.tile(angles, (len(state.env_steps), 1, 1))
+    def _first_obs(self, state: EnvState) -> np.ndarray:
+        stance = self.scene.stance.qpos[self.scene.leg_qpos]
+        angles = np.tile(stance, (len(state.env_steps), 1, 1))
+        if state.errors is not None:
+            angles = angles + state.errors.encoders
         return observation(self.task, self.scene.robot, state.memory, angles)
 
     def step(
@@ -95,11 +100,16 @@ class BatchEnv:
         """Takes one decision, in envs `ids` or all; `change` is a_x and a_y of the actions, m."""
         before = self.state if ids is None else rows(self.state, ids)
         envs: np.ndarray = before.physics
-        noise, params = None, before.params
-        if params is not None and params.imu_noise.any():
-            shape = (self.task.sim_steps, params.imu_noise.shape[-1])
-            noise = np.stack([self._rngs[k].normal(size=shape) for k in envs])
-        after, outcome = step(self.task, self.scene.robot, self._engine, before, change, noise)
+        draws, params = None, before.params
+        if params is not None and (params.imu_noise.any() or before.errors is not None):
+            rngs = [self._rngs[k] for k in envs]
+            draws = draw_decision(
+                self.task,
+                before.errors,
+                lambda shape: np.stack([rng.normal(size=shape) for rng in rngs]),
+                lambda shape: np.stack([rng.uniform(size=shape) for rng in rngs]),
+            )
+        after, outcome = step(self.task, self.scene.robot, self._engine, before, change, draws)
         _set_rows(self.state.memory, envs, after.memory)
         self.state.env_steps[envs] = after.env_steps
         return outcome

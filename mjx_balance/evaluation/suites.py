@@ -1,20 +1,20 @@
 """The evaluation suites: scenarios, domain parameters and pushes that a controller is tried on."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 
 import numpy as np
 
-from mjx_balance.config import RandomizationConfig, TaskConfig
+from mjx_balance.config import DEGREE, RandomizationConfig, TaskConfig
 from mjx_balance.config.sea import check_platform
 from mjx_balance.envs.batch import Episodes, stacked
 from mjx_balance.errors import InputError
 from mjx_balance.robots.catalogue import Robot
-from mjx_balance.robots.limits import authority, greatest_incline, scale_ranges
+from mjx_balance.robots.limits import authority, check_delays, greatest_incline, scale_ranges
 from mjx_balance.task import tilt
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, draw_params
+from mjx_balance.task.sensors import count_draws, draw_errors
 
 
 class SuiteError(InputError):
@@ -43,7 +43,6 @@ class Suite:
     soft: bool = False  #: whether the robot stands on soft servos (`sim.scene.soften`)
     fast: bool = False  #: board speeds uniform from the config's to the authority limit
     steep: bool = False  #: inclines uniform from the config's to the reach of the legs
-    tilted: bool = False  #: board and body start tilted, by up to a decision from a fall
 
 
 SUITES: dict[str, Suite] = {
@@ -58,10 +57,25 @@ SUITES: dict[str, Suite] = {
     "push": Suite(RandomizationConfig(push_min=0.2, push_max=0.4)),  # any direction, every 5 s
     "fast": Suite(fast=True),
     "steep": Suite(steep=True),
-    "recover": Suite(tilted=True),
     "steps": Suite(motion="steps"),  # jumps of up to two thirds of the fall limit
     "sea": Suite(motion="sea"),  # waves in all directions
     "platform": Suite(motion="sea", platform=True),  # which surges, sways and heaves as well
+    "bias": Suite(  # an IMU that is off by what makers allow, mounted half a degree awry
+        RandomizationConfig(
+            gyro_bias=0.5 * DEGREE,
+            gyro_bias_drift=0.01 * DEGREE,
+            accel_bias=0.05,
+            accel_bias_drift=0.001,
+            imu_tilt=0.5 * DEGREE,
+        )
+    ),
+    "encoder": Suite(RandomizationConfig(encoder_offset=0.02)),  # of every joint, rad
+    "delay": Suite(  # samples and commands that are 0 to 40 ms late, three quarters of it steady
+        RandomizationConfig(
+            sensor_delay=0.03, sensor_jitter=0.01, command_delay=0.03, command_jitter=0.01
+        )
+    ),
+    "dropout": Suite(RandomizationConfig(dropout=0.1)),  # every tenth IMU sample is lost
 }
 """By the names of `mjx-balance evaluate --suite`."""
 HEADLINE = ("paper", "corner")  #: evaluated after training, in reports and tables
@@ -94,10 +108,10 @@ def draw_suite(
     """Draws a suite's episodes, each of `duration` s.
 
     Scenario k of a seed is the same however many are drawn. Ramps, sensor noise, pushes, other
-    motions and starts come from generators of their own, told apart by their last number.
+    motions and sensor errors come from generators of their own, told apart by their last number.
 
     Raises:
-      ConfigError: if the sea of the config is out of bounds.
+      ConfigError: if the sea of the config is out of bounds, or a decision shorter than the delays.
       SuiteError: for an unknown suite, a negative seed, a suite that needs another scene
         (`rollout.suite_scene`), or a board that does not arrive before its next target.
     """
@@ -126,7 +140,12 @@ def draw_suite(
             f"target_period is {task.target_period} s, but in suite {suite!r} the board may take "
             f"{longest:.1f} s to its target; the period must not be shorter"
         )
-    ranges = scale_ranges(chosen.randomization, robot)
+    ranges, errors = scale_ranges(chosen.randomization, robot), None
+    check_delays(task, ranges, robot)
+    if ranges.sensors_err:
+        own = [np.random.default_rng((seed, k, 4)) for k in range(scenarios)]
+        numbers = np.asarray([rng.uniform(size=count_draws(robot)) for rng in own])
+        errors = draw_errors(ranges, robot, numbers)
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     if chosen.motion is not None:
         draw = tilt.MOTIONS[chosen.motion]
@@ -134,16 +153,12 @@ def draw_suite(
         check_platform(still)
         own = [np.random.default_rng((seed, k, 3)) for k in range(scenarios)]
         scenario = stacked([draw(still, count, tilt.numpy_uniform(rng)) for rng in own])
-    if chosen.tilted:
-        limit = np.full(scenarios, task.fail_tilt - math.sqrt(2) * task.board_rate * task.ctrl_dt)
-        own = [np.random.default_rng((seed, k, 4)) for k in range(scenarios)]
-        start = tilt.disc_targets(limit, *np.asarray([rng.uniform(size=2) for rng in own]).T)
-        scenario = scenario._replace(start=start)
     return Episodes(
         scenario=scenario,
         params=draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None,
         pushes=_draw_pushes(task, ranges, scenarios, duration, seed),
         rngs=[np.random.default_rng((seed, k, 1)) for k in range(scenarios)],
+        errors=errors,
     )
 
 

@@ -53,6 +53,25 @@ def delay_steps(task: TaskConfig, robot: Robot) -> int:
     return round(robot.command_delay / task.sim_dt)
 
 
+def check_delays(task: TaskConfig, ranges: RandomizationConfig, robot: Robot) -> None:
+    """Checks that samples and commands come within their decision.
+
+    Raises:
+      ConfigError: names the greatest delay, its jitter and a bound.
+    """
+    legs = (task.sim_steps - task.ramp_steps) * task.sim_dt - robot.command_delay
+    for kind, most, end in (
+        ("sensor", task.ctrl_dt, "a sample may be a decision old, ctrl_dt"),
+        ("command", legs, "the legs must arrive before the next decision"),
+    ):
+        delay, jitter = getattr(ranges, f"{kind}_delay"), getattr(ranges, f"{kind}_jitter")
+        if delay + jitter > most + 1e-9:
+            raise ConfigError(
+                f"{kind}_delay is {delay} s and {kind}_jitter {jitter} s, together "
+                f"{delay + jitter:g}; {end}: together they must be at most {max(most, 0):g}"
+            )
+
+
 def check_body(body: Body) -> None:
     """Checks a body that was measured elsewhere.
 
@@ -98,6 +117,7 @@ def check_robot(config: Config, robot: Robot) -> Config:
             f"arrive before the next decision it must be at most {rest * task.sim_dt:g}: ctrl_dt, "
             f"{task.ctrl_dt} s, less action_ramp's share of it"
         )
+    check_delays(task, ranges, robot)
     own = robot.foot_friction
     if ranges.friction_min is None and (ranges.friction_max or own) < own:
         raise ConfigError(

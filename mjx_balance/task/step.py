@@ -28,6 +28,16 @@ from mjx_balance.task.observation import (
 from mjx_balance.task.pushes import Pushes, push_velocity
 from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.reward import RewardInputs, failed, reward_terms
+from mjx_balance.task.sensors import (
+    COMMAND,
+    Draws,
+    SensorErrors,
+    SensorMemory,
+    late_steps,
+    sense,
+    servo_targets,
+    start_sensors,
+)
 
 DIVERGED = 1e4  #: magnitude, in rad, rad/s, m/s^2 or deg, from which a value counts as diverged
 
@@ -42,6 +52,7 @@ class Memory(NamedTuple):
     imu: Float[Array, "*batch samples 6"]  #: latest IMU samples, the newest last, rad/s and m/s^2
     tilt: Float[Array, "*batch"]  #: body tilt of the last reward, deg
     means: Means | None = None  #: None: no row of the observation has a time constant
+    sensors: SensorMemory | None = None  #: None: without `EnvState.errors`
 
 
 class Targets(NamedTuple):
@@ -84,6 +95,7 @@ class EnvState(NamedTuple):
     env_steps: Int[Array, "*batch"]  #: decisions since the episode's start
     params: DomainParams | None  #: None: the nominal model, no sensor noise, no action delay
     pushes: Pushes | None
+    errors: SensorErrors | None = None  #: None: sensors and commands are right, but for `params`
 
 
 class Outcome(NamedTuple):
@@ -91,7 +103,7 @@ class Outcome(NamedTuple):
 
     obs: Float[Array, "*batch obs_size"]  #: the network's next input
     rewards: dict[str, Float[Array, "*batch"]]  #: by name (`reward_terms`); their sum is the reward
-    imu: Float[Array, "*batch sim_steps 6"]  #: IMU samples with noise, rad/s and m/s^2
+    imu: Float[Array, "*batch sim_steps 6"]  #: IMU samples that the robot got, rad/s and m/s^2
     tilt: Float[Array, "*batch sim_steps"]  #: body tilt after each step, deg
     terminated: Bool[Array, "*batch"]  #: the body fell, or the simulation diverged
     diverged: Bool[Array, "*batch"]  #: whether the simulation gave values that no robot can reach
@@ -108,19 +120,28 @@ def step(
     engine: Engine,
     state: EnvState,
     change: Float[Array, "*batch 2"],
-    noise: Float[Array, "*batch sim_steps 6"] | None,
+    draws: Draws | None,
 ) -> tuple[EnvState, Outcome]:
     """Takes one decision, in one env or in a batch; returns the state after it, and the outcome.
 
-    `change` is a_x and a_y of the action, m; `noise` has a standard normal number per IMU sample.
+    `change` is a_x and a_y of the action, m; `draws` are the decision's random numbers, None if
+    nothing is wrong with the sensors.
     """
-    memory, targets = pre_step(task, robot, state, change)
-    physics, params = state.physics, state.params
+    memory, targets = pre_step(task, robot, state, change, draws)
+    physics, params, errors = state.physics, state.params, state.errors
+    if errors is not None:
+        joints = servo_targets(errors, state.env_steps, targets.joints)
+        targets = targets._replace(joints=joints)
     if state.pushes is not None:
         physics = engine.push(physics, push_velocity(state.pushes, state.env_steps))
     physics, motion = engine.advance(physics, targets, params)
-    if noise is not None and params is not None:
-        motion = motion._replace(imu=motion.imu + params.imu_noise[..., None, :] * noise)
+    if errors is not None:
+        angles = motion.joint_angles + errors.encoders[..., None, :, :]
+        motion = motion._replace(joint_angles=angles)
+    if draws is not None and params is not None:
+        last = memory.imu[..., -1, :]
+        sensors, imu = sense(task, params, errors, memory.sensors, last, motion.imu, draws)
+        memory, motion = memory._replace(sensors=sensors), motion._replace(imu=imu)
     memory, outcome = post_step(task, robot, memory, motion)
     state = state._replace(physics=physics, memory=memory, env_steps=state.env_steps + 1)
     return state, outcome
@@ -130,35 +151,35 @@ def initial_memory(
     task: TaskConfig,
     robot: Robot,
     still: Float[Array, "*batch 6"],
-    tilt: Float[Array, "*batch"] | None = None,
+    errors: SensorErrors | None = None,
 ) -> Memory:
-    """The memory of a robot that has been standing for a while.
-
-    Args:
-      task: the observation.
-      robot: the same.
-      still: IMU samples, rad/s and m/s^2.
-      tilt: of the body, deg; None: level.
-    """
-    xp, rows = still.__array_namespace__(), input_rows(task, robot)
+    """The memory of a robot that has been standing for a while, with true IMU samples `still`."""
+    xp, rows, sensors = still.__array_namespace__(), input_rows(task, robot), None
+    if errors is not None:
+        sensors, still = start_sensors(task, errors, still)
     heights = xp.full((*still.shape[:-1], len(robot.legs)), task.body_height, still.dtype)
     means = mean_rows(rows)
     return Memory(
         heights=heights,
         commanded=xp.repeat(heights[..., None, :], lookback(rows, "commands"), axis=-2),
         imu=xp.repeat(still[..., None, :], lookback(rows, "imu"), axis=-2),
-        tilt=xp.zeros_like(still[..., 0]) if tilt is None else tilt,
+        tilt=xp.zeros_like(still[..., 0]),
         means=start_means(means, task.sim_dt, still) if means else None,
+        sensors=sensors,
     )
 
 
 def pre_step(
-    task: TaskConfig, robot: Robot, state: EnvState, change: Float[Array, "*batch 2"]
+    task: TaskConfig,
+    robot: Robot,
+    state: EnvState,
+    change: Float[Array, "*batch 2"],
+    draws: Draws | None = None,
 ) -> tuple[Memory, Targets]:
     """Turns an action, a_x and a_y in m, into servo targets and the memory with the new command.
 
     Targets of step i are for time (i + 1) * sim_dt of the decision. With an action delay the legs
-    obey one decision later; with a command delay of the robot, so much later in the decision.
+    obey one decision later; with a command delay, so much later in the decision.
     `state.physics` does not matter.
     """
     memory, xp = state.memory, state.memory.heights.__array_namespace__()
@@ -172,9 +193,12 @@ def pre_step(
     if task.platform:
         position = tilt.platform_position(task, state.scenario, time)
         board = xp.concatenate((board, position), axis=-1)
-    delay = delay_steps(task, robot)
-    path = kinematics.ramp(task, memory.heights, heights, np.asarray(delay, float))
-    arrival = delay + task.ramp_steps
+    delay = np.asarray(delay_steps(task, robot), float)
+    arrival = int(delay) + task.ramp_steps
+    if state.errors is not None and draws is not None:
+        delay = delay + late_steps(task, state.errors, draws, COMMAND)
+        arrival = task.sim_steps
+    path = kinematics.ramp(task, memory.heights, heights, delay)
     moving = kinematics.joint_angles(robot, path[..., :arrival, :])
     resting = xp.repeat(moving[..., -1:, :, :], task.sim_steps - arrival, axis=-3)
     commanded = extend_history(memory.commanded, command[..., None, :])
@@ -190,8 +214,8 @@ def post_step(
     Where the simulation diverged the robot has fallen: its tilt counts as `fail_tilt` throughout
     the decision, the IMU holds its last sample, and the legs count as at their targets.
 
-    `memory` is that of `pre_step`; `motion` includes sensor noise. Returns the memory for the next
-    decision, and the outcome.
+    `memory` is that of `pre_step`; `motion` has what the sensors give. Returns the memory for the
+    next decision, and the outcome.
     """
     samples, tilts, angles = motion.imu, motion.tilt, motion.joint_angles[..., -1, :, :]
     xp = samples.__array_namespace__()

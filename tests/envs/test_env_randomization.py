@@ -114,6 +114,38 @@ def test_pushes_change_no_other_draw(fleet: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
+ERRORS = {
+    "gyro_bias": 0.01,
+    "sensor_delay": 0.03,
+    "command_delay": 0.02,
+    "encoder_offset": 0.02,
+    "dropout": 0.2,
+}
+
+
+def test_sensor_errors_fill_their_ranges_and_change_no_other_draw(fleet: Any) -> None:
+    """Of each env its own; the first observation shows them."""
+    config = fleet.env.config
+    ranges = dataclasses.replace(config.randomization, **ERRORS)
+    env = BalanceEnv(dataclasses.replace(config, randomization=ranges))
+    keys = jax.random.split(jax.random.PRNGKey(7), 1_000)
+    ours, theirs = (jax.device_get(jax.jit(jax.vmap(e.reset))(keys)) for e in (env, fleet.env))
+    errors = ours.pipeline_state.errors
+    limits = {"bias": 0.01, "encoders": 0.02}
+    for name, most in limits.items():
+        values = getattr(errors, name)[..., :3].ravel()
+        assert scipy.stats.kstest(values, "uniform", (-most, 2 * most)).pvalue > 1e-3, name
+    for k, most in enumerate((0.03, 0.02)):
+        assert scipy.stats.kstest(errors.delay[:, k], "uniform", (0, most)).pvalue > 1e-3
+    for name in ("params", "scenario", "pushes"):
+        parts = (getattr(x.pipeline_state, name) for x in (ours, theirs))
+        jax.tree.map(np.testing.assert_array_equal, *parts)
+    names = list(observation_names(config.task, env.scene.robot))
+    shown = np.radians(ours.obs[:, names.index("V_x,t-0")])
+    np.testing.assert_allclose(shown, errors.bias[:, 0], atol=1e-5)
+    assert np.abs(ours.obs[:, 0] - theirs.obs[:, 0]).max() > 0.3, "mm"
+
+
 def test_nobody_is_pushed_unless_asked_for() -> None:
     """Nor in an episode that ends, after 60 s, when the first push is due."""
     rare = RandomizationConfig(push_max=0.2, push_period=60.0)

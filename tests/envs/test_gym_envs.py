@@ -231,6 +231,25 @@ def test_every_sample_has_noise_of_its_own(config: Config) -> None:
     assert np.abs(np.corrcoef(added[:, 4:].T) - np.eye(30)).max() < 0.5
 
 
+def test_every_episode_has_sensors_that_err_in_their_own_way(config: Config) -> None:
+    """The first observation shows a bias; the second episode of an env has another."""
+    ranges = RandomizationConfig(gyro_bias=0.01, encoder_offset=0.02)
+    env = BalanceVecEnv(3, config=dataclasses.replace(short(config, 2), randomization=ranges))
+    first = env.reset(seed=0)[0]
+    stand = np.full(3, STAND)
+    env.step(stand)
+    second = env.step(stand)[0]  # the episodes end, and others begin
+    for obs in (first, second):
+        assert env.batch is not None
+        assert env.batch.state.errors is not None
+        assert np.ptp(obs[:, 4]) > 0.1, "deg/s"
+        assert np.ptp(obs[:, 0]) > 0.1, "cm"
+    np.testing.assert_allclose(
+        np.radians(second[:, 4]), env.batch.state.errors.bias[:, 0], atol=1e-6
+    )
+    assert np.abs(first - second)[:, 4].min() > 1e-3
+
+
 @pytest.mark.parametrize(("share", "square"), [(0.0, 49 / 6), (1.0, 49 / 3), (0.5, 49 / 4)])
 def test_boards_are_those_of_training(
     config: Config, robot: Robot, share: float, square: float

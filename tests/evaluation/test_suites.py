@@ -5,20 +5,19 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig, preset
-from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.envs.batch import BatchEnv, Episodes, rows
+from mjx_balance.envs.batch import Episodes, rows
 from mjx_balance.evaluation.controllers import View, make_controller
 from mjx_balance.evaluation.rollout import roll_out, run_suite, suite_scene
 from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite
 from mjx_balance.robots.catalogue import SHIPPED, Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
-from mjx_balance.sim.scene import load_scene
+from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.randomization import DRAWS, draw_params
+from mjx_balance.task.sensors import draw_errors
 from mjx_balance.task.tilt import MOTIONS, board_angle, numpy_uniform, platform_position
 
 
@@ -259,7 +258,7 @@ def test_impossible_wishes_are_refused(config: Config) -> None:
         draw(config, "paper", 1, 10, -1)
     names = (
         "paper, corner, noise, payload, friction, gains, soft, latency, push, fast, steep, steps, "
-        "sea, platform"
+        "sea, platform, bias, encoder, delay, dropout"
     )
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
         draw(config, "moon", 1, 10, 0)
@@ -306,6 +305,62 @@ def test_conditions_fill_their_range(
             np.testing.assert_array_equal(getattr(params, name), getattr(nominal, name))
 
 
+@pytest.mark.parametrize(
+    ("suite", "most"),
+    [
+        ("bias", {"bias": np.radians(0.5), "mounting": np.radians(0.5)}),
+        ("encoder", {"encoders": 0.02}),
+        ("delay", {"delay": 0.03, "jitter": 0.01}),
+        ("dropout", {"dropout": 0.1}),
+    ],
+)
+def test_sensor_errors_fill_their_range(config: Config, suite: str, most: dict[str, float]) -> None:
+    """By a generator of each scenario's own; targets and noise are those of `paper`."""
+    episodes, paper = (draw(config, name, 200, 10, 0) for name in (suite, "paper"))
+    np.testing.assert_array_equal(episodes.scenario.targets, paper.scenario.targets)
+    errors = episodes.errors
+    for name, values in errors._asdict().items():
+        if name not in most:
+            assert (suite == "bias" and name == "drift") or not values.any(), name
+    for name, limit in most.items():
+        values = getattr(errors, name)
+        if name == "bias":  # of the gyro; the accelerometer has 0.05 m/s^2
+            assert 0.97 * 0.05 < np.abs(values[:, 3:]).max() <= 0.05
+            values = values[:, :3]
+        assert 0.97 * limit < np.abs(values).max() <= limit * (1 + 1e-9)
+    drawn = draw_errors(
+        SUITES[suite].randomization,
+        find_robot("quadruped"),
+        np.random.default_rng((0, 7, 4)).uniform(size=29),
+    )
+    for ours, theirs in zip(rows(errors, np.asarray(7)), drawn, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert paper.errors is None
+
+
+def test_a_controller_sees_what_the_sensors_give(config: Config, scene: Scene) -> None:
+    """From the first samples on; the truth about tilt and joints stays true."""
+    episodes, seen = draw(config, "bias", 3, 0.4, 0), []
+
+    def watch(view: View) -> np.ndarray:
+        seen.append(view.imu)
+        return np.zeros((3, 2))
+
+    roll_out(scene, watch, episodes, 0.4)
+    errors = episodes.errors
+    assert errors is not None
+    # Gravity is along z, and so a small turn about y shows in x.
+    shown = errors.bias[:, 3] - 9.81 * errors.mounting[:, 1]
+    np.testing.assert_allclose(seen[0][:, 0, 3] - scene.stance.imu[3], shown, atol=2e-3)
+    np.testing.assert_allclose(seen[0][:, -1, :3], errors.bias[:, :3], atol=1e-4)
+    assert not np.allclose(seen[1], seen[0])
+
+
+def test_a_suite_whose_delays_are_longer_than_a_decision_is_refused(config: Config) -> None:
+    with pytest.raises(ConfigError, match=r"^sensor_delay is 0.03 s .* at most 0.02$"):
+        draw(with_task(config, ctrl_dt=0.02), "delay", 1, 1.0, 0)
+
+
 def test_every_suite_follows_the_configs_incline(config: Config) -> None:
     flat = with_task(config, max_incline=2.0)
     for name, suite in SUITES.items():
@@ -322,43 +377,3 @@ def test_loads_and_pushes_go_with_the_robot() -> None:
     speeds = np.linalg.norm(draw(config, "push", 100, 60.0, 0).pushes.velocity, axis=-1)
     limits = (speeds.min(), speeds.max())
     assert limits == pytest.approx((0.2 * 1.702, 0.4 * 1.702), rel=0.01)
-
-
-def test_robots_recover_from_a_start_on_a_tilted_board(config: Config) -> None:
-    """Up to what the board turns in a decision from a fall; whoever stands still is no better."""
-    scenario = draw(config, "recover", 200, 20.0, 5).scenario
-    assert scenario.start is not None
-    assert 4.8 < np.hypot(*scenario.start.T).max() <= 6 - np.hypot(0.7, 0.7)
-    np.testing.assert_array_equal(
-        scenario.targets, draw(config, "paper", 200, 20.0, 5).scenario.targets
-    )
-    scene = load_scene(config)
-    rollouts = {
-        name: run_suite(scene, make_controller(name, scene), "recover", 16, 4.0, 5)
-        for name in ("none", "pd-imu")
-    }
-    size = np.hypot(*draw(config, "recover", 16, 4.0, 5).scenario.start.T)
-    for rollout in rollouts.values():
-        np.testing.assert_allclose(rollout.tilt[:, 0], size, atol=0.1)
-    assert not rollouts["pd-imu"].fell.any()
-    assert rollouts["pd-imu"].tilt[:, -50:].mean() < 0.3 < 2 < size.mean()
-
-
-def test_training_starts_tilted_as_evaluation_does(config: Config) -> None:
-    """The same start in MJX's env and in plain MuJoCo: observation, tilt before, first decision."""
-    config = dataclasses.replace(with_task(config, start_incline=5.0), engine="mujoco")
-    env = BalanceEnv(config)
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 4))
-    scenario = jax.tree.map(np.asarray, state.pipeline_state.scenario)
-    batch = BatchEnv(load_scene(config), Episodes(scenario, rngs=[np.random.default_rng(0)] * 4))
-    np.testing.assert_allclose(np.asarray(state.obs), batch.initial_obs, atol=2e-4)
-    before = batch.state.memory.tilt
-    np.testing.assert_allclose(before, np.hypot(*scenario.start.T), atol=0.02)  # of the stance
-    np.testing.assert_allclose(state.pipeline_state.memory.tilt, before, rtol=1e-4)
-    after = jax.vmap(env.step)(state, jnp.full(4, 220))
-    outcome = batch.step(np.zeros((4, 2)))
-    np.testing.assert_allclose(after.metrics["tilt_deg"], outcome.tilt.mean(axis=1), rtol=1e-3)
-    np.testing.assert_allclose(after.reward, outcome.reward, atol=1e-3)
-    again = Episodes(jax.tree.map(lambda x: x[:1], scenario), rngs=[np.random.default_rng(0)])
-    batch.reset(np.asarray([2]), again)
-    np.testing.assert_array_equal(batch.initial_obs[2], batch.initial_obs[0])

@@ -92,6 +92,33 @@ def test_legs_that_obey_too_late_are_refused(robot: Robot) -> None:
         check_robot(config, late)
 
 
+@pytest.mark.parametrize(
+    ("kind", "most", "why"),
+    [
+        ("sensor", 0.2, "a sample may be a decision old, ctrl_dt"),
+        ("command", 0.14, "the legs must arrive before the next decision"),
+    ],
+)
+def test_delays_longer_than_a_decision_are_refused(
+    robot: Robot, kind: str, most: float, why: str
+) -> None:
+    """Of 0.2 s; commands of a robot that takes 0.04 s itself, with a ramp of 0.02 s."""
+    slow, config = dataclasses.replace(robot, command_delay=0.04), preset("paper")
+
+    def late(delay: float) -> Config:
+        ranges = {f"{kind}_delay": delay, f"{kind}_jitter": 0.02}
+        randomization = dataclasses.replace(config.randomization, **ranges)
+        return dataclasses.replace(config, randomization=randomization)
+
+    assert check_robot(late(most - 0.02), slow)
+    message = (
+        f"^{kind}_delay is {most:g} s and {kind}_jitter 0.02 s, together {most + 0.02:g}; {why}: "
+        f"together they must be at most {most:g}$"
+    )
+    with pytest.raises(ConfigError, match=message):
+        check_robot(late(most), slow)
+
+
 def test_another_robots_config_is_scaled_by_its_mass_and_size() -> None:
     """Of 83.5 kg and 0.3285 m, against 15.2 kg and 0.193 m: 5.493 and 1.702."""
     best = preset("best")
