@@ -23,7 +23,7 @@ class EvaluateArgs(ControllerArgs):
 
     suite: str = "paper"
     """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast,
-    steep, steps, sea or platform."""
+    steep, recover, steps, sea, platform, bias, encoder, delay or dropout."""
     scenarios: int = 256
     """Number of scenarios."""
     duration: float = 60.0

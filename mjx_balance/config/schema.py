@@ -79,6 +79,9 @@ class TaskConfig:
     and sways by the same (chosen: a slight sea)."""
     sea_heading: Annotated[float, Ge(-360), Le(360)] | None = None
     """Mean direction in which the waves run, deg from straight ahead to the left; none: any."""
+    start_incline: Annotated[float, Ge(0), Lt(90)] = 0.0
+    """Greatest tilt of the board at the start of a training episode, and of the body that stands on
+    it, deg; in any direction (paper: it starts level)."""
     fail_tilt: Annotated[float, Gt(0), Lt(90)] = 6.0
     """Body tilt that counts as a fall, deg (paper 3.1)."""
     action_max: Positive = 0.003

@@ -82,6 +82,11 @@ def _check_motions(task: TaskConfig) -> None:
             f"step_rate is {task.step_rate} deg/s; for a jump to end within target_period, "
             f"{task.target_period} s, it must be at least {slowest:.3g}"
         )
+    if task.start_incline >= task.fail_tilt:
+        raise ConfigError(
+            f"start_incline is {task.start_incline} deg; it must be less than fail_tilt, "
+            f"{task.fail_tilt} deg: a robot that starts with it has fallen"
+        )
     significant_angle(task)
     if task.platform and "sea" not in task.board_motions:
         raise ConfigError(

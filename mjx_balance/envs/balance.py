@@ -122,11 +122,12 @@ class BalanceEnv(Env):
         def uniform(shape: tuple[int, ...], low: float, high: float) -> jax.Array:
             return jax.random.uniform(next(keys), shape, jnp.float32, low, high)
 
-        still = jnp.asarray(scene.stance.imu, jnp.float32)
+        scenario = draw_scenario(task, uniform)
+        qpos, still, tilt = (jnp.asarray(x, jnp.float32) for x in scene.start(scenario.start))
         start = EnvState(
-            physics=self.engine.initial(),
-            memory=initial_memory(task, robot, still, errors),
-            scenario=draw_scenario(task, uniform),
+            physics=self.engine.initial(qpos),
+            memory=initial_memory(task, robot, still, tilt, errors),
+            scenario=scenario,
             env_steps=jnp.int32(0),
             params=params,
             pushes=pushes,

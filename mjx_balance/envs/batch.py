@@ -61,35 +61,37 @@ class BatchEnv:
     """n envs of one scene. `step` resets none of them."""
 
     def __init__(self, scene: Scene, episodes: Episodes, threads: int | None = None):
-        """Starts all envs, robots settled on level boards, with worker threads; None: all cores."""
+        """Starts all envs, robots settled on their boards, with worker threads; None: all cores."""
         self.scene, self.task = scene, scene.task
         self.num_envs = len(episodes.scenario.phase)
         self._engine = MujocoEngine(scene, self.num_envs, threads)
         self.state = self._initial(np.arange(self.num_envs), episodes)
         self._rngs = list(episodes.rngs)
-        self.initial_obs = self._first_obs(self.state)
-        """(n, obs_size) of the robots when they were last reset."""
+        self.initial_obs = self._observe_start(self.state)
+        """(n, obs_size) at the start of the episodes."""
 
     def reset(self, ids: Int[np.ndarray, " k"], episodes: Episodes) -> None:
         """Starts envs `ids` anew; episodes have what may be None if the first ones had it."""
-        state = self._initial(ids, episodes)
-        _set_rows(self.state, ids, state)
-        self.initial_obs[ids] = self._first_obs(state)
-        self._engine.reset(ids)
+        start = self._initial(ids, episodes)
+        _set_rows(self.state, ids, start)
+        self.initial_obs[ids] = self._observe_start(start)
         for k, rng in zip(ids, episodes.rngs, strict=True):
             self._rngs[k] = rng
 
     def _initial(self, ids: np.ndarray, episodes: Episodes) -> EnvState:
-        still = np.tile(self.scene.stance.imu, (len(ids), 1))
-        memory = initial_memory(self.task, self.scene.robot, still, episodes.errors)
+        """The state in which envs `ids` start; puts the engine there."""
+        start, count = self.scene.start(episodes.scenario.start), len(ids)
+        still, tilt = np.broadcast_to(start.imu, (count, 6)), np.broadcast_to(start.tilt, count)
+        self._engine.reset(ids, start.qpos)
+        memory = initial_memory(self.task, self.scene.robot, still, tilt, episodes.errors)
         env_steps = np.zeros(len(ids), int)
         scenario, params, pushes, _, errors = episodes
         state = EnvState(ids, memory, scenario, env_steps, params, pushes, errors)
         return _tree_map(np.array, state)  # a copy, which may be written to
 
-    def _first_obs(self, state: EnvState) -> np.ndarray:
-        stance = self.scene.stance.qpos[self.scene.leg_qpos]
-        angles = np.tile(stance, (len(state.env_steps), 1, 1))
+    def _observe_start(self, state: EnvState) -> np.ndarray:
+        angles = self.scene.stance.qpos[self.scene.leg_qpos]
+        angles = np.tile(angles, (len(state.env_steps), 1, 1))
         if state.errors is not None:
             angles = angles + state.errors.encoders
         return observation(self.task, self.scene.robot, state.memory, angles)

@@ -127,9 +127,10 @@ class ImuPD(AttitudePD):
 
     def state(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Filters the last decision's samples; see `AttitudePD.state`."""
+        gyro, by_gravity = view.imu[..., :2], gravity_angles(view.imu[..., 3:])
         if view.env_steps == 0:
             self.angle = np.zeros((view.ids.max() + 1, ACTION_AXES))
-        gyro, by_gravity = view.imu[..., :2], gravity_angles(view.imu[..., 3:])
+            self.angle[view.ids] = by_gravity[:, 0]
         dt = self.task.sim_dt
         leak = dt / (self.tau + dt)
         weight = (1 - leak) ** np.arange(view.imu.shape[1])[::-1, None]

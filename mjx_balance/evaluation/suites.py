@@ -1,6 +1,7 @@
 """The evaluation suites: scenarios, domain parameters and pushes that a controller is tried on."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -43,6 +44,7 @@ class Suite:
     soft: bool = False  #: whether the robot stands on soft servos (`sim.scene.soften`)
     fast: bool = False  #: board speeds uniform from the config's to the authority limit
     steep: bool = False  #: inclines uniform from the config's to the reach of the legs
+    tilted: bool = False  #: board and body start tilted, by up to a decision from a fall
 
 
 SUITES: dict[str, Suite] = {
@@ -57,6 +59,7 @@ SUITES: dict[str, Suite] = {
     "push": Suite(RandomizationConfig(push_min=0.2, push_max=0.4)),  # any direction, every 5 s
     "fast": Suite(fast=True),
     "steep": Suite(steep=True),
+    "recover": Suite(tilted=True),
     "steps": Suite(motion="steps"),  # jumps of up to two thirds of the fall limit
     "sea": Suite(motion="sea"),  # waves in all directions
     "platform": Suite(motion="sea", platform=True),  # which surges, sways and heaves as well
@@ -108,7 +111,8 @@ def draw_suite(
     """Draws a suite's episodes, each of `duration` s.
 
     Scenario k of a seed is the same however many are drawn. Ramps, sensor noise, pushes, other
-    motions and sensor errors come from generators of their own, told apart by their last number.
+    motions, starts and sensor errors come from generators of their own, told apart by their last
+    number.
 
     Raises:
       ConfigError: if the sea of the config is out of bounds, or a decision shorter than the delays.
@@ -143,7 +147,7 @@ def draw_suite(
     ranges, errors = scale_ranges(chosen.randomization, robot), None
     check_delays(task, ranges, robot)
     if ranges.sensors_err:
-        own = [np.random.default_rng((seed, k, 4)) for k in range(scenarios)]
+        own = [np.random.default_rng((seed, k, 5)) for k in range(scenarios)]
         numbers = np.asarray([rng.uniform(size=count_draws(robot)) for rng in own])
         errors = draw_errors(ranges, robot, numbers)
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
@@ -153,6 +157,11 @@ def draw_suite(
         check_platform(still)
         own = [np.random.default_rng((seed, k, 3)) for k in range(scenarios)]
         scenario = stacked([draw(still, count, tilt.numpy_uniform(rng)) for rng in own])
+    if chosen.tilted:
+        limit = np.full(scenarios, task.fail_tilt - math.sqrt(2) * task.board_rate * task.ctrl_dt)
+        own = [np.random.default_rng((seed, k, 4)) for k in range(scenarios)]
+        start = tilt.disc_targets(limit, *np.asarray([rng.uniform(size=2) for rng in own]).T)
+        scenario = scenario._replace(start=start)
     return Episodes(
         scenario=scenario,
         params=draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None,

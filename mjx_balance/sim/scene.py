@@ -5,6 +5,8 @@ import dataclasses
 import functools
 import hashlib
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -18,6 +20,7 @@ from mjx_balance.robots.measure import OUR_LEG, OUR_STIFFNESS
 from mjx_balance.robots.model import scene_dir
 from mjx_balance.robots.robot import gain_text, per_joint
 from mjx_balance.task import Array
+from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
 from mjx_balance.task.step import Targets
 
@@ -43,6 +46,14 @@ class Stance:
     """Added to the joint angles so that the servos reach them under load, rad: the robot's own
     weight would otherwise bend the legs by millimetres."""
     imu: Float[np.ndarray, "6"]  #: gyro in rad/s and accelerometer in m/s^2 at rest
+
+
+class Start(NamedTuple):
+    """Where an episode starts."""
+
+    qpos: Float[Array, "*batch nq"]
+    imu: Float[Array, "*batch 6"]  #: rad/s and m/s^2
+    tilt: Float[Array, "*batch"]  #: of the body, deg
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,10 +91,49 @@ class Scene(Layout):
         order = np.argsort(np.concatenate(servos))
         return xp.concatenate(flat, axis=-1)[..., order]
 
+    def start(self, tilt: Float[Array, "*batch 2"] | None) -> Start:
+        """The stance, on a board at rest at angles about X and Y, deg, robot and board as one."""
+        stance = self.stance
+        if tilt is None:
+            return Start(stance.qpos, stance.imu, np.zeros(()))
+        xp = tilt.__array_namespace__()
+        angle = tilt * (np.pi / 180)
+        (ca, cb), (sa, sb) = (np.moveaxis(f(angle), -1, 0) for f in (xp.cos, xp.sin))
+        qpos = [xp.zeros_like(ca) + value for value in stance.qpos]
+        for k, address in enumerate(self.board_qpos):
+            qpos[address] = angle[..., k]
+        # X is the outer hinge: the turn is that about X times that about Y.
+        root = self.trunk_quat[0] - 3
+        x, y, z = stance.qpos[root : root + 3]
+        x, z = cb * x + sb * z, cb * z - sb * x
+        qpos[root : root + 3] = x, ca * y - sa * z, sa * y + ca * z
+        cosines, sines = xp.cos(angle / 2), xp.sin(angle / 2)
+        about_x = [cosines[..., 0], sines[..., 0], 0, 0]
+        about_y = [cosines[..., 1], 0, sines[..., 1], 0]
+        turned = _times(_times(about_x, about_y), stance.qpos[self.trunk_quat].tolist())
+        qpos[root + 3 : root + 7] = turned
+        x, y, z = stance.imu[3:]
+        y, z = ca * y + sa * z, ca * z - sa * y
+        still = [xp.zeros_like(ca) + value for value in stance.imu[:3]]
+        imu = xp.stack((*still, cb * x - sb * z, y, cb * z + sb * x), axis=-1)
+        return Start(xp.stack(qpos, axis=-1), imu, body_tilt(xp.stack(turned, axis=-1)))
+
     @property
     def hash(self) -> str:
         """Fingerprint of the physics: equal for equal dynamics, whatever the looks."""
         return scene_hash(self.model)
+
+
+def _times(first: Sequence[Array], second: Sequence[Array]) -> list[Array]:
+    """Product of two quaternions, w first."""
+    a, b, c, d = first
+    w, x, y, z = second
+    return [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
 
 
 def build_model(task: TaskConfig, robot_source: str, visual: bool = False) -> mujoco.MjModel:

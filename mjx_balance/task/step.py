@@ -151,9 +151,18 @@ def initial_memory(
     task: TaskConfig,
     robot: Robot,
     still: Float[Array, "*batch 6"],
+    tilt: Float[Array, "*batch"] | None = None,
     errors: SensorErrors | None = None,
 ) -> Memory:
-    """The memory of a robot that has been standing for a while, with true IMU samples `still`."""
+    """The memory of a robot that has been standing for a while.
+
+    Args:
+      task: the observation.
+      robot: the same.
+      still: true IMU samples, rad/s and m/s^2.
+      tilt: of the body, deg; None: level.
+      errors: of the sensors; None: they are right.
+    """
     xp, rows, sensors = still.__array_namespace__(), input_rows(task, robot), None
     if errors is not None:
         sensors, still = start_sensors(task, errors, still)
@@ -163,7 +172,7 @@ def initial_memory(
         heights=heights,
         commanded=xp.repeat(heights[..., None, :], lookback(rows, "commands"), axis=-2),
         imu=xp.repeat(still[..., None, :], lookback(rows, "imu"), axis=-2),
-        tilt=xp.zeros_like(still[..., 0]),
+        tilt=xp.zeros_like(still[..., 0]) if tilt is None else tilt,
         means=start_means(means, task.sim_dt, still) if means else None,
         sensors=sensors,
     )

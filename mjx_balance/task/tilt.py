@@ -35,7 +35,7 @@ class Waves(NamedTuple):
 class Scenario(NamedTuple):
     """Where the board goes (paper 3.1).
 
-    The board starts level. It takes aim at `targets[k]` at time
+    The board starts level, or at `start`. It takes aim at `targets[k]` at time
     `k * target_period - phase` and stays there once it has arrived.
     """
 
@@ -43,6 +43,8 @@ class Scenario(NamedTuple):
     phase: Float[Array, "*batch"]  #: time the first target is already old at time 0, s
     rate: Float[Array, "*batch"]  #: speed of the board on each axis, deg/s
     waves: Waves | None = None  #: None: none
+    start: Float[Array, "*batch 2"] | None = None
+    """Board angles at time 0, deg, which the body shares; None: level."""
 
 
 def numpy_uniform(rng: np.random.Generator) -> Uniform:
@@ -94,14 +96,14 @@ def _toward_targets(
     task: TaskConfig, scenario: Scenario, time: Float[Array, "*batch times"]
 ) -> Float[Array, "*batch times 2"]:
     """Angle of a board without waves, deg."""
-    targets, phase, rate, _ = scenario
+    targets, phase, rate, _, first = scenario
     xp = targets.__array_namespace__()
     clock = time + phase[..., None]
     last = targets.shape[-2] - 1
     period = xp.clip(xp.floor(clock / task.target_period), 0, last).astype(int)
     since = clock - period * task.target_period
-    level = xp.zeros_like(targets[..., :1, :])
-    stops = xp.concatenate((level, targets), axis=-2)
+    first = xp.zeros_like(targets[..., :1, :]) if first is None else first[..., None, :]
+    stops = xp.concatenate((first, targets), axis=-2)
     start = xp.take_along_axis(stops, period[..., None], axis=-2)
     change = xp.take_along_axis(targets, period[..., None], axis=-2) - start
     reach = (rate[..., None] * since)[..., None]
@@ -129,13 +131,26 @@ def disc_targets(
 def draw_scenario(task: TaskConfig, uniform: Uniform) -> Scenario:
     """Draws one scenario of training, long enough for an episode.
 
-    With several kinds of motion each is drawn equally often. Ramps alone have no waves.
+    With several kinds of motion each is drawn equally often. Ramps alone have no waves. A board
+    that starts tilted stays so until its second target.
 
     Args:
       task: kinds of motion and their numbers, the episode's length.
       uniform: (shape, low, high) -> new random numbers in [low, high), at most `MOST_CALLS` times;
         the calls always come in the same order.
     """
+    scenario = _draw_motion(task, uniform)
+    if not task.start_incline:
+        return scenario
+    draws = uniform((2,), 0.0, 1.0)
+    xp = draws.__array_namespace__()
+    start = disc_targets(xp.asarray(task.start_incline, dtype=draws.dtype), *draws)
+    first = np.arange(len(scenario.targets))[:, None] == 0
+    return scenario._replace(targets=xp.where(first, start, scenario.targets), start=start)
+
+
+def _draw_motion(task: TaskConfig, uniform: Uniform) -> Scenario:
+    """Draws the motion of a board that starts level."""
     count = num_targets(task, task.episode_length * task.ctrl_dt)
     drawn = [MOTIONS[name](task, count, uniform) for name in task.board_motions]
     if len(drawn) == 1:

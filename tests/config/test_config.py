@@ -160,6 +160,7 @@ BOUNDS: list[tuple[str, tuple[Any, ...], tuple[Any, ...]]] = [
     ("target_period", (4.0, 60.0), (0.0, -10.0, 3.99)),
     ("board_motions", (("sea",), ("ramps", "steps", "sea")), ((), ("sail",), ("sea", "sea"))),
     ("step_rate", (0.4, 100.0), (0.0, -1.0, 0.39)),
+    ("start_incline", (0.0, 5.99), (-1.0, 6.0, 90.0)),
     ("sea_angle", (None, 0.0, 4.38), (-1.0, 4.4, 7.01)),
     ("sea_period", (1.0, 30.0), (0.0, -10.0)),
     ("sea_height", (0.0, 1.0, 30.0), (-0.5,)),

@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig, preset
-from mjx_balance.envs.batch import Episodes, rows
+from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.evaluation.controllers import View, make_controller
 from mjx_balance.evaluation.rollout import roll_out, run_suite, suite_scene
 from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite
@@ -257,8 +259,8 @@ def test_impossible_wishes_are_refused(config: Config) -> None:
     with pytest.raises(SuiteError, match="seed is -1; it must not be negative"):
         draw(config, "paper", 1, 10, -1)
     names = (
-        "paper, corner, noise, payload, friction, gains, soft, latency, push, fast, steep, steps, "
-        "sea, platform, bias, encoder, delay, dropout"
+        "paper, corner, noise, payload, friction, gains, soft, latency, push, fast, steep, "
+        "recover, steps, sea, platform, bias, encoder, delay, dropout"
     )
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
         draw(config, "moon", 1, 10, 0)
@@ -331,7 +333,7 @@ def test_sensor_errors_fill_their_range(config: Config, suite: str, most: dict[s
     drawn = draw_errors(
         SUITES[suite].randomization,
         find_robot("quadruped"),
-        np.random.default_rng((0, 7, 4)).uniform(size=29),
+        np.random.default_rng((0, 7, 5)).uniform(size=29),
     )
     for ours, theirs in zip(rows(errors, np.asarray(7)), drawn, strict=True):
         np.testing.assert_array_equal(ours, theirs)
@@ -377,3 +379,43 @@ def test_loads_and_pushes_go_with_the_robot() -> None:
     speeds = np.linalg.norm(draw(config, "push", 100, 60.0, 0).pushes.velocity, axis=-1)
     limits = (speeds.min(), speeds.max())
     assert limits == pytest.approx((0.2 * 1.702, 0.4 * 1.702), rel=0.01)
+
+
+def test_robots_recover_from_a_start_on_a_tilted_board(config: Config) -> None:
+    """Up to what the board turns in a decision from a fall; whoever stands still is no better."""
+    scenario = draw(config, "recover", 200, 20.0, 5).scenario
+    assert scenario.start is not None
+    assert 4.8 < np.hypot(*scenario.start.T).max() <= 6 - np.hypot(0.7, 0.7)
+    np.testing.assert_array_equal(
+        scenario.targets, draw(config, "paper", 200, 20.0, 5).scenario.targets
+    )
+    scene = load_scene(config)
+    rollouts = {
+        name: run_suite(scene, make_controller(name, scene), "recover", 16, 4.0, 5)
+        for name in ("none", "pd-imu")
+    }
+    size = np.hypot(*draw(config, "recover", 16, 4.0, 5).scenario.start.T)
+    for rollout in rollouts.values():
+        np.testing.assert_allclose(rollout.tilt[:, 0], size, atol=0.1)
+    assert not rollouts["pd-imu"].fell.any()
+    assert rollouts["pd-imu"].tilt[:, -50:].mean() < 0.3 < 2 < size.mean()
+
+
+def test_training_starts_tilted_as_evaluation_does(config: Config) -> None:
+    """The same start in MJX's env and in plain MuJoCo: observation, tilt before, first decision."""
+    config = dataclasses.replace(with_task(config, start_incline=5.0), engine="mujoco")
+    env = BalanceEnv(config)
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 4))
+    scenario = jax.tree.map(np.asarray, state.pipeline_state.scenario)
+    batch = BatchEnv(load_scene(config), Episodes(scenario, rngs=[np.random.default_rng(0)] * 4))
+    np.testing.assert_allclose(np.asarray(state.obs), batch.initial_obs, atol=2e-4)
+    before = batch.state.memory.tilt
+    np.testing.assert_allclose(before, np.hypot(*scenario.start.T), atol=0.02)  # of the stance
+    np.testing.assert_allclose(state.pipeline_state.memory.tilt, before, rtol=1e-4)
+    after = jax.vmap(env.step)(state, jnp.full(4, 220))
+    outcome = batch.step(np.zeros((4, 2)))
+    np.testing.assert_allclose(after.metrics["tilt_deg"], outcome.tilt.mean(axis=1), rtol=1e-3)
+    np.testing.assert_allclose(after.reward, outcome.reward, atol=1e-3)
+    again = Episodes(jax.tree.map(lambda x: x[:1], scenario), rngs=[np.random.default_rng(0)])
+    batch.reset(np.asarray([2]), again)
+    np.testing.assert_array_equal(batch.initial_obs[2], batch.initial_obs[0])

@@ -2,9 +2,11 @@
 
 import copy
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -355,3 +357,30 @@ def test_a_platform_is_as_heavy_for_another_robot(config: Config) -> None:
     for field in ("dof_armature", "dof_damping"):
         np.testing.assert_allclose(getattr(b2, field)[:3], 5.493 * getattr(ours, field)[:3])
     np.testing.assert_allclose(b2.actuator_gainprm[:3, 0], 5.493 * 2e6)
+
+
+def test_a_start_on_a_tilted_board_is_the_stance_turned_with_the_board(scene: Scene) -> None:
+    """The turn is MuJoCo's own of the board's body, gravity that in the turned frame."""
+    tilts = np.random.default_rng(0).uniform(-6, 6, (3, 2))
+    data, stance = mujoco.MjData(scene.model), scene.stance
+    for tilt, qpos, imu, lean in zip(tilts, *scene.start(tilts), strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(scene.model, data)
+        board, trunk = data.body("board/board"), data.body(scene.trunk)
+        np.testing.assert_allclose(np.degrees(qpos[scene.board_qpos]), tilt, atol=1e-9)
+        turned = board.xmat.reshape(3, 3)
+        root = scene.trunk_quat[0] - 3
+        np.testing.assert_allclose(trunk.xpos, turned @ stance.qpos[root : root + 3], atol=1e-9)
+        level = np.zeros(9)
+        mujoco.mju_quat2Mat(level, stance.qpos[scene.trunk_quat])
+        np.testing.assert_allclose(
+            trunk.xmat.reshape(3, 3), turned @ level.reshape(3, 3), atol=1e-9
+        )
+        np.testing.assert_allclose(imu[3:], turned.T @ stance.imu[3:], atol=1e-9)
+        np.testing.assert_array_equal(imu[:3], stance.imu[:3])
+        np.testing.assert_array_equal(qpos[scene.leg_qpos], stance.qpos[scene.leg_qpos])
+        upright = math.degrees(math.acos(trunk.xmat[8]))
+        np.testing.assert_allclose(lean, upright, atol=1e-6)
+    one = scene.start(jnp.asarray(tilts[0], jnp.float32))
+    np.testing.assert_allclose(one.qpos, scene.start(tilts).qpos[0], atol=1e-6)
+    np.testing.assert_array_equal(scene.start(None).qpos, stance.qpos)

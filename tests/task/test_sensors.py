@@ -181,7 +181,7 @@ class Obedient:
 
 def state_of(robot: Robot, number: int) -> step.EnvState:
     errors = errors_of(robot)
-    memory = step.initial_memory(TASK, robot, np.tile(STILL, (N, 1)), errors)
+    memory = step.initial_memory(TASK, robot, np.tile(STILL, (N, 1)), errors=errors)
     level = Scenario(np.zeros((N, 1, 2)), np.zeros(N), np.full(N, 3.5))
     env_steps = np.full(N, number)
     return step.EnvState(np.zeros(N), memory, level, env_steps, nominal(), None, errors)

@@ -318,3 +318,23 @@ def test_several_kinds_are_drawn_equally_often() -> None:
     ramps, alone = moving & ~jumping, drawn(TASK, 600)
     np.testing.assert_array_equal(every.targets[ramps], alone.targets[ramps])
     np.testing.assert_array_equal(every.phase[ramps], alone.phase[ramps])
+
+
+def test_a_board_that_starts_tilted_stays_so_until_its_second_target() -> None:
+    """In every direction, up to the bound; else the scenario is that of a board that is level."""
+    task = dataclasses.replace(TASK, start_incline=5.0)
+    level, tilted = drawn(TASK), drawn(task)
+    assert level.start is None
+    assert tilted.start is not None
+    size = np.hypot(*tilted.start.T)
+    assert 4.9 < size.max() <= 5.0
+    np.testing.assert_allclose(size.mean(), 2.5, atol=0.2)
+    np.testing.assert_allclose(tilted.start.mean(axis=0), 0, atol=0.3)
+    np.testing.assert_array_equal(tilted.targets[:, 1:], level.targets[:, 1:])
+    wait = TASK.target_period - tilted.phase
+    times = wait[:, None] * np.asarray((0, 0.5, 0.99))
+    angle = board_angle(task, tilted, times)
+    np.testing.assert_array_equal(angle, np.tile(tilted.start[:, None], (1, 3, 1)))
+    goal = np.clip(tilted.targets[:, 1] - tilted.start, -0.35, 0.35)
+    after = board_angle(task, tilted, (wait + 0.1)[:, None])[:, 0]
+    np.testing.assert_allclose(after, tilted.start + goal, atol=1e-9)

@@ -29,10 +29,11 @@ class JaxEngine:
     physics: Callable[[PhysicsState, jax.Array, DomainParams | None], tuple[PhysicsState, Motion]]
     """State, ctrl (sim_steps, nu) in the scene's order of servos, params -> state, motion."""
 
-    def initial(self) -> PhysicsState:
-        """The settled stance."""
+    def initial(self, qpos: Float[jax.Array, " nq"] | None = None) -> PhysicsState:
+        """At rest in the settled stance, or elsewhere."""
         stance = self.scene.stance
-        parts = (stance.qpos, stance.qvel, stance.qacc_warmstart)
+        qpos = stance.qpos if qpos is None else qpos
+        parts = (qpos, stance.qvel, stance.qacc_warmstart)
         return PhysicsState(*(jnp.asarray(part, jnp.float32) for part in parts))
 
     def push(self, physics: PhysicsState, velocity: Float[jax.Array, "2"]) -> PhysicsState:

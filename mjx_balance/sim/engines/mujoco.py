@@ -41,10 +41,11 @@ class MujocoEngine:
         self.set_state(*physics)
         self._batch.warning[...] = warning
 
-    def reset(self, ids: Ids) -> None:
-        """Puts envs back into the settled stance."""
+    def reset(self, ids: Ids, qpos: Float[np.ndarray, "*n nq"] | None = None) -> None:
+        """Puts envs to rest in the settled stance, or elsewhere."""
         stance = self.scene.stance
-        self._batch.qpos[ids], self._batch.qvel[ids] = stance.qpos, stance.qvel
+        self._batch.qpos[ids] = stance.qpos if qpos is None else qpos
+        self._batch.qvel[ids] = stance.qvel
         self._batch.qacc_warmstart[ids] = stance.qacc_warmstart
         self._batch.warning[ids] = 0
 
