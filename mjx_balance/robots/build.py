@@ -450,7 +450,7 @@ def _forward(file: RobotFile, data: mujoco.MjData) -> np.ndarray:
 
 
 def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
-    """Adds servos and IMU, and removes passive joint forces other than the servos' damping."""
+    """Adds servos and IMU, and removes all passive joint forces but the servos' own."""
     for element in [*spec.actuators]:
         spec.delete(element)
     for body in spec.bodies:
@@ -461,12 +461,13 @@ def _equip(spec: mujoco.MjSpec, robot: Robot, site: str) -> None:
         joint.springdamper, joint.actgravcomp = [0, 0], False
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     torques = (robot.hip_torque, robot.hip_torque, robot.knee_torque)
-    fields = (robot.servo_stiffness, robot.servo_damping, robot.servo_armature)
-    numbers = [*zip(torques, *map(per_joint, fields), strict=True)]
+    fields = ("servo_stiffness", "servo_damping", "servo_armature", "servo_friction")
+    numbers = [*zip(torques, *(per_joint(getattr(robot, x)) for x in fields), strict=True)]
     for leg in robot.legs:
-        for name, (torque, stiffness, damping, armature) in zip(leg.joints, numbers, strict=True):
-            joint = spec.joint(name)
-            joint.damping, joint.armature = [damping, 0, 0], armature
+        for name, (torque, stiffness, *passive) in zip(leg.joints, numbers, strict=True):
+            joint, (damping, armature, friction) = spec.joint(name), passive
+            joint.damping = [damping, 0, 0]
+            joint.armature, joint.frictionloss = armature, friction
             servo = spec.add_actuator(
                 FRESH.default,
                 name=name,

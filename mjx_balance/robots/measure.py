@@ -93,6 +93,7 @@ def measure(
         body_height=height,
         action_max=file.action_max or _three_digits(OUR_ACTION * body.lever / OUR_LEVER),
         command_delay=file.command_delay,
+        servo_friction=file.servo_friction or 0.0,
     )
     # The policy file repeats this check, but only after the training.
     return check_types(robot, RobotError)

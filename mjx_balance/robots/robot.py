@@ -122,6 +122,7 @@ class Robot(Body):
     body_height: Number  #: standing height of the trunk's origin, foot radius included, m
     action_max: Number  #: greatest height change of one decision on one axis, m
     command_delay: Delay = 0.0  #: time until the servos obey a command, s
+    servo_friction: Gain = 0.0  #: dry friction of the gears at the joint, N m
 
 
 def per_joint(gain: Gain) -> np.ndarray:

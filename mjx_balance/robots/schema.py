@@ -91,6 +91,7 @@ class RobotFile:
     action_max: Positive | None = None  #: greatest height change of one decision on one axis, m
     board_size: Positive | None = None  #: length of the board in training, m
     command_delay: Delay = 0.0  #: time until the servos obey a command, s
+    servo_friction: Gain | None = None  #: dry friction of the gears at the joint, N m; none: 0
     source: str = ""  #: where the model is from
     license: str = ""  #: of the model
 
@@ -100,6 +101,7 @@ REMEDIES = {
     "servo_stiffness": _GAIN,
     "servo_damping": _GAIN,
     "servo_armature": _GAIN,
+    "servo_friction": _GAIN,
     "model": "be a name",
     "trunk": "be a name",
     "legs": "be four tables, as [legs.FL]",

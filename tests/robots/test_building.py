@@ -315,7 +315,7 @@ def test_a_files_own_numbers_win(tmp_path: Path) -> None:
 
 def test_gains_of_abduction_hip_and_knee_may_differ(tmp_path: Path) -> None:
     gains = {"stiffness": [60.0, 50.0, 80.0], "damping": [5.0, 4.0, 7.0]}
-    gains["armature"] = [0.1, 0.2, 0.3]
+    gains |= {"armature": [0.1, 0.2, 0.3], "friction": [0.01, 0.02, 0.03]}
     fields: dict[str, Any] = {f"servo_{name}": f"{values}" for name, values in gains.items()}
     scene = scene_of(bodies.write_robot(tmp_path, **fields))
     for joints in (leg.joints for leg in scene.robot.legs):
@@ -325,6 +325,7 @@ def test_gains_of_abduction_hip_and_knee_may_differ(tmp_path: Path) -> None:
         assert [-x.biasprm[1] for x in servos] == gains["stiffness"]
         assert [x.damping[0] for x in moving] == gains["damping"]
         assert [x.armature[0] for x in moving] == gains["armature"]
+        assert [x.frictionloss[0] for x in moving] == gains["friction"]
     assert from_dict(Robot, json.loads(json.dumps(dataclasses.asdict(scene.robot)))) == scene.robot
 
 
