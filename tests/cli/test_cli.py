@@ -4,6 +4,8 @@ import dataclasses
 import json
 import os
 import shutil
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +26,7 @@ from mjx_balance.evaluation.controllers import View, make_controller
 from mjx_balance.evaluation.rollout import observing, run_suite, summarize
 from mjx_balance.files.run_folder import RunFolderError, create_run_folder, locked, write_json
 from mjx_balance.policy.file import PolicyError, load_policy
-from mjx_balance.render.drawing import VIDEO_SIZE
+from mjx_balance.render.drawing import VIDEO_SIZE, RenderError
 from mjx_balance.report.progress import Display
 from mjx_balance.report.tables import print_summary
 from mjx_balance.robots.catalogue import SHIPPED as SHIPPED_ROBOTS
@@ -418,6 +420,25 @@ def test_a_robots_draft_can_be_checked(capsys: pytest.CaptureFixture[str]) -> No
     assert "mjx-balance: robot rex has no torque left at 7 deg" in said.err
     assert "_knee' takes 100% of its own" in said.err
     assert said.out.endswith("picture: rex-check.png\n")
+
+
+def test_a_check_without_a_picture_says_why(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "mjx_balance.render.drawing.write", mock.Mock(side_effect=RenderError("no OpenGL"))
+    )
+    assert main(["robot", "check", "quadruped"]) == FAILED
+    said = capsys.readouterr()
+    assert said.err == "mjx-balance: no picture drawn: no OpenGL\n"
+    assert "picture:" not in said.out
+
+
+def test_the_module_runs_as_the_command_does() -> None:
+    command = [sys.executable, "-m", "mjx_balance", "fly"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "unknown command 'fly'" in done.stderr
 
 
 def test_a_policy_stands_on_its_own_robot_alone(capsys: pytest.CaptureFixture[str]) -> None:

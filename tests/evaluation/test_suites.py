@@ -419,3 +419,16 @@ def test_training_starts_tilted_as_evaluation_does(config: Config) -> None:
     again = Episodes(jax.tree.map(lambda x: x[:1], scenario), rngs=[np.random.default_rng(0)])
     batch.reset(np.asarray([2]), again)
     np.testing.assert_array_equal(batch.initial_obs[2], batch.initial_obs[0])
+
+
+def test_an_episode_begun_anew_is_as_noisy_as_its_generator(config: Config) -> None:
+    """Env 1 of 3 after a reset equals the first env of another batch, sample by sample."""
+    scene = load_scene(config)
+    first, second = (draw(config, "noise", 3, 10.0, seed) for seed in (5, 6))
+    batch, other = BatchEnv(scene, first), BatchEnv(scene, second)
+    one = Episodes(*(rows(part, np.arange(1)) for part in second[:3]), rngs=[second.rngs[0]])
+    batch.step(np.zeros((3, 2)))
+    imu = other.step(np.zeros((3, 2))).imu[0]
+    (again,) = draw(config, "noise", 1, 10.0, 6).rngs
+    batch.reset(np.asarray([1]), one._replace(rngs=[again]))
+    np.testing.assert_array_equal(batch.step(np.zeros((3, 2))).imu[1], imu)

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -70,7 +70,7 @@ def noticed(groups: list[list[str]], seconds: float) -> str | None:
     return None
 
 
-def failing(files: Iterable[str], seconds: float, marker: str | None = None) -> str | None:
+def failing(files: Sequence[str], seconds: float, marker: str | None = None) -> str | None:
     """Runs test files in this process' copy, in a fork, until the first failure.
 
     Args:
@@ -93,7 +93,9 @@ def failing(files: Iterable[str], seconds: float, marker: str | None = None) -> 
             code = os.waitstatus_to_exitcode(status)
             if code in (0, pytest.ExitCode.NO_TESTS_COLLECTED):
                 return None
-            if code == pytest.ExitCode.USAGE_ERROR:
+            # With the files there, it is a conftest that cannot be imported.
+            there = all((where / file).is_file() for file in files)
+            if code == pytest.ExitCode.USAGE_ERROR and not there:
                 raise RuntimeError(f"pytest {' '.join(files)} cannot run")
             return witness.failed.read_text() if witness.failed.is_file() else "the import"
         with contextlib.suppress(FileNotFoundError):

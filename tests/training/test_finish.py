@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 from collections.abc import Callable
 from typing import Any
 from unittest import mock
@@ -223,6 +224,7 @@ def test_a_run_killed_while_it_finishes_finishes_again(
             event = Event.FromString(content[12 : 12 + length])
             tags += [value.tag for value in event.summary.value]
             assert not event.summary.value or event.step == 64
+            assert abs(event.wall_time - time.time()) < 3_600
             content = content[16 + length :]
     names = ["falls", *(f"tilt_{name}" for name in ("mean", "rms", "p50", "p95", "p99", "max"))]
     assert sorted(tags) == sorted(f"eval/{s}/{n}" for s in ("paper", "corner") for n in names)
