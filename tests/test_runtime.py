@@ -115,7 +115,7 @@ def test_it_does_what_the_evaluation_does_step_by_step(
     for k in range(count):
         readings = np.concatenate([x[k] for x in imu])[samples - 1 :]
         angles = np.concatenate((scene.stance.qpos[None], rollout.qpos[k]))[:, scene.leg_qpos]
-        angles = angles if errors is None else angles + errors.encoders[k]
+        angles = angles if errors is None else angles + errors.encoders[k] + errors.readings[k]
         rig = Rig(path)
         targets, actions = [], []
         for reading, angle in zip(readings, angles, strict=False):

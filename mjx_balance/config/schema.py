@@ -179,6 +179,8 @@ class RandomizationConfig:
     """Greatest turn of the IMU against the trunk about every axis, rad."""
     encoder_offset: NonNegative = 0.0
     """Greatest error of every joint encoder, by which the servos go as well, rad."""
+    reading_offset: NonNegative = 0.0
+    """Greatest further error of every joint's reading, of which the servos know nothing, rad."""
     sensor_delay: NonNegative = 0.0
     """Greatest age of the IMU's samples, the same throughout an episode, s."""
     sensor_jitter: NonNegative = 0.0
@@ -222,9 +224,9 @@ class RandomizationConfig:
     def sensors_err(self) -> bool:
         """Whether more is wrong with sensors or commands than noise and a decision's delay."""
         biases = self.gyro_bias, self.gyro_bias_drift, self.accel_bias, self.accel_bias_drift
-        shapes = self.imu_scale, self.imu_tilt, self.encoder_offset, self.dropout
+        offsets = self.imu_tilt, self.encoder_offset, self.reading_offset
         delays = self.sensor_delay, self.sensor_jitter, self.command_delay, self.command_jitter
-        return any((*biases, *shapes, *delays))
+        return any((*biases, *offsets, *delays, self.imu_scale, self.dropout))
 
 
 @dataclasses.dataclass(frozen=True)

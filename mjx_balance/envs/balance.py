@@ -15,7 +15,7 @@ from mjx_balance.task.observation import input_rows
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, draw_params
 from mjx_balance.task.reward import reward_rows
-from mjx_balance.task.sensors import count_draws, draw_decision, draw_errors
+from mjx_balance.task.sensors import count_draws, draw_decision, draw_errors, joint_readings
 from mjx_balance.task.step import EnvState, initial_memory, observation, step
 from mjx_balance.task.symmetry import Symmetries, symmetries
 from mjx_balance.task.tilt import MOST_CALLS, draw_scenario
@@ -135,7 +135,7 @@ class BalanceEnv(Env):
         )
         angles = start.physics.qpos[scene.leg_qpos]
         if errors is not None:
-            angles = angles + errors.encoders
+            angles = joint_readings(errors, angles)
         obs = observation(task, robot, start.memory, angles)
         zero = jnp.float32(0.0)
         rewards = [f"reward_{row.name}" for row in reward_rows(task)]

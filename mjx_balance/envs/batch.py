@@ -12,7 +12,13 @@ from mjx_balance.sim.engines.mujoco import MujocoEngine
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
-from mjx_balance.task.sensors import SensorErrors, count_draws, draw_decision, draw_errors
+from mjx_balance.task.sensors import (
+    SensorErrors,
+    count_draws,
+    draw_decision,
+    draw_errors,
+    joint_readings,
+)
 from mjx_balance.task.step import EnvState, Outcome, initial_memory, observation, step
 from mjx_balance.task.tilt import Scenario, draw_scenario, numpy_uniform
 
@@ -93,7 +99,7 @@ class BatchEnv:
         angles = self.scene.stance.qpos[self.scene.leg_qpos]
         angles = np.tile(angles, (len(state.env_steps), 1, 1))
         if state.errors is not None:
-            angles = angles + state.errors.encoders
+            angles = joint_readings(state.errors, angles)
         return observation(self.task, self.scene.robot, state.memory, angles)
 
     def step(

@@ -72,7 +72,9 @@ SUITES: dict[str, Suite] = {
             imu_tilt=0.5 * DEGREE,
         )
     ),
-    "encoder": Suite(RandomizationConfig(encoder_offset=0.02)),  # of every joint, rad
+    "encoder": Suite(  # every joint, rad
+        RandomizationConfig(encoder_offset=0.02, reading_offset=0.02)
+    ),
     "delay": Suite(  # samples and commands that are 0 to 40 ms late, three quarters of it steady
         RandomizationConfig(
             sensor_delay=0.03, sensor_jitter=0.01, command_delay=0.03, command_jitter=0.01

@@ -24,7 +24,8 @@ class SensorErrors(NamedTuple):
     bias: Float[Array, "*batch 6"]  #: at the start, rad/s and m/s^2
     scale: Float[Array, "*batch 6"]  #: relative
     mounting: Float[Array, "*batch 3"]  #: turn of the IMU from the trunk, as a vector, rad
-    encoders: Float[Array, "*batch legs 3"]  #: measured less true joint angles, rad
+    encoders: Float[Array, "*batch legs 3"]  #: what the servos measure, less true angles, rad
+    readings: Float[Array, "*batch legs 3"]  #: what the robot reads, less what they measure, rad
     delay: Float[Array, "*batch 2"]  #: least age of samples and of commands, s
     drift: Float[Array, "*batch 6"]  #: standard deviation that the bias gains, per sqrt(s)
     jitter: Float[Array, "*batch 2"]  #: greatest further age in a decision, s
@@ -64,11 +65,11 @@ def draw_errors(
     for name, most in _symmetric(ranges, robot).items():
         draws = uniform[..., done : done + len(most)]
         parts[name], done = np.asarray(most, uniform.dtype) * (2 * draws - 1), done + len(most)
-    encoders = parts.pop("encoders")
+    for name in ("encoders", "readings"):
+        parts[name] = xp.reshape(parts[name], (*parts[name].shape[:-1], len(robot.legs), 3))
     delay = every(ranges.sensor_delay, ranges.command_delay) * uniform[..., done:]
     return SensorErrors(
         **parts,
-        encoders=xp.reshape(encoders, (*encoders.shape[:-1], len(robot.legs), 3)),
         delay=delay,
         drift=every(*[ranges.gyro_bias_drift] * 3, *[ranges.accel_bias_drift] * 3),
         jitter=every(ranges.sensor_jitter, ranges.command_jitter),
@@ -83,6 +84,7 @@ def _symmetric(ranges: RandomizationConfig, robot: Robot) -> dict[str, list[floa
         "scale": [ranges.imu_scale] * 6,
         "mounting": [ranges.imu_tilt] * 3,
         "encoders": [ranges.encoder_offset] * 3 * len(robot.legs),
+        "readings": [ranges.reading_offset] * 3 * len(robot.legs),
     }
 
 
@@ -158,6 +160,13 @@ def late_steps(
     """Physics steps by which samples (`IMU`) or commands (`COMMAND`) come later, whole numbers."""
     delay = (errors.delay + errors.jitter * draws.jitter)[..., which]
     return delay.__array_namespace__().round(delay / task.sim_dt)
+
+
+def joint_readings(
+    errors: SensorErrors, angles: Float[Array, "*batch legs 3"]
+) -> Float[Array, "*batch legs 3"]:
+    """What the robot reads of true joint angles, rad."""
+    return angles + errors.encoders + errors.readings
 
 
 def servo_targets(

@@ -33,6 +33,7 @@ from mjx_balance.task.sensors import (
     Draws,
     SensorErrors,
     SensorMemory,
+    joint_readings,
     late_steps,
     sense,
     servo_targets,
@@ -136,8 +137,8 @@ def step(
         physics = engine.push(physics, push_velocity(state.pushes, state.env_steps))
     physics, motion = engine.advance(physics, targets, params)
     if errors is not None:
-        angles = motion.joint_angles + errors.encoders[..., None, :, :]
-        motion = motion._replace(joint_angles=angles)
+        angles = joint_readings(errors, motion.joint_angles[..., -1, :, :])
+        motion = motion._replace(joint_angles=angles[..., None, :, :])
     if draws is not None and params is not None:
         last = memory.imu[..., -1, :]
         sensors, imu = sense(task, params, errors, memory.sensors, last, motion.imu, draws)

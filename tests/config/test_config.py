@@ -179,7 +179,7 @@ BOUNDS: list[tuple[str, tuple[Any, ...], tuple[Any, ...]]] = [
     ("gyro_noise accel_noise payload push_max", (0.0, 0.1), (-0.1,)),
     ("gyro_bias gyro_bias_drift accel_bias accel_bias_drift", (0.0, 0.1), (-0.1,)),
     ("sensor_delay sensor_jitter command_delay command_jitter", (0.0, 0.1), (-0.1,)),
-    ("encoder_offset", (0.0, 0.1), (-0.1,)),
+    ("encoder_offset reading_offset", (0.0, 0.1), (-0.1,)),
     ("imu_tilt", (0.0, 0.5), (-0.1, 0.51)),
     ("imu_scale dropout", (0.0, 0.9), (-0.1, 1.0)),
     ("friction_min friction_max", (None, 0.8), (0.0, -0.5)),

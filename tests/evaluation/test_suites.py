@@ -311,7 +311,7 @@ def test_conditions_fill_their_range(
     ("suite", "most"),
     [
         ("bias", {"bias": np.radians(0.5), "mounting": np.radians(0.5)}),
-        ("encoder", {"encoders": 0.02}),
+        ("encoder", {"encoders": 0.02, "readings": 0.02}),
         ("delay", {"delay": 0.03, "jitter": 0.01}),
         ("dropout", {"dropout": 0.1}),
     ],
@@ -333,7 +333,7 @@ def test_sensor_errors_fill_their_range(config: Config, suite: str, most: dict[s
     drawn = draw_errors(
         SUITES[suite].randomization,
         find_robot("quadruped"),
-        np.random.default_rng((0, 7, 5)).uniform(size=29),
+        np.random.default_rng((0, 7, 5)).uniform(size=41),
     )
     for ours, theirs in zip(rows(errors, np.asarray(7)), drawn, strict=True):
         np.testing.assert_array_equal(ours, theirs)

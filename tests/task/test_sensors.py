@@ -37,6 +37,7 @@ RANGES = RandomizationConfig(
     imu_scale=0.02,
     imu_tilt=0.1,
     encoder_offset=0.02,
+    reading_offset=0.01,
     sensor_delay=0.03,
     sensor_jitter=0.01,
     command_delay=0.024,
@@ -46,7 +47,7 @@ RANGES = RandomizationConfig(
 
 
 def errors_of(robot: Robot) -> SensorErrors:
-    return draw_errors(RANGES, robot, np.random.default_rng(3).uniform(size=(N, 29)))
+    return draw_errors(RANGES, robot, np.random.default_rng(3).uniform(size=(N, 41)))
 
 
 def draws_of(robot: Robot) -> list[Draws]:
@@ -78,17 +79,18 @@ def test_every_draw_lands_in_its_own_field(
     xp: types.ModuleType, robot: Robot, compiled: Any
 ) -> None:
     """Biases, scales, mounting, encoders: 0 is the least, 1/2 nothing, 1 the greatest; delays."""
-    assert count_draws(robot) == 29
-    draws = np.asarray([np.full(29, 0.5), np.linspace(0, 1, 29), np.zeros(29)])
+    assert count_draws(robot) == 41
+    draws = np.asarray([np.full(41, 0.5), np.linspace(0, 1, 41), np.zeros(41)])
     got = compiled(partial(draw_errors, RANGES, robot))(xp.asarray(draws, float))
-    ramp = 2 * np.linspace(0, 1, 29) - 1
+    ramp = 2 * np.linspace(0, 1, 41) - 1
     np.testing.assert_allclose(got.bias[1, :3], 0.01 * ramp[:3], rtol=1e-5)
     np.testing.assert_allclose(got.bias[1, 3:], 0.05 * ramp[3:6], rtol=1e-5)
     np.testing.assert_allclose(got.scale[1], 0.02 * ramp[6:12], rtol=1e-5)
     np.testing.assert_allclose(got.mounting[1], 0.1 * ramp[12:15], rtol=1e-4, atol=1e-8)
     np.testing.assert_allclose(got.encoders[1].ravel(), 0.02 * ramp[15:27], rtol=1e-4)
-    np.testing.assert_allclose(got.delay, [(0.015, 0.012), (0.03 * 27 / 28, 0.024), (0, 0)], 1e-5)
-    for name in ("bias", "scale", "mounting", "encoders"):
+    np.testing.assert_allclose(got.readings[1].ravel(), 0.01 * ramp[27:39], rtol=1e-4)
+    np.testing.assert_allclose(got.delay, [(0.015, 0.012), (0.03 * 39 / 40, 0.024), (0, 0)], 1e-5)
+    for name in ("bias", "scale", "mounting", "encoders", "readings"):
         assert not np.asarray(getattr(got, name))[0].any(), name
         assert (np.asarray(getattr(got, name))[2] < 0).all(), name
     np.testing.assert_allclose(got.drift, [[0.001] * 3 + [0.002] * 3] * 3, rtol=1e-6)
@@ -212,7 +214,7 @@ def test_legs_obey_later_by_the_delay_and_its_jitter(robot: Robot) -> None:
 
 
 def test_servos_go_by_encoders_that_are_off(robot: Robot) -> None:
-    """The robot reads the heights that it commanded, and its feet are elsewhere."""
+    """Its feet are elsewhere than it commanded; readings that err by themselves show that alone."""
     draws = draws_of(robot)
     for number in (0, 3):
         state = state_of(robot, number)
@@ -226,9 +228,12 @@ def test_servos_go_by_encoders_that_are_off(robot: Robot) -> None:
         _, outcome = step.step(TASK, robot, Watched(), state, CHANGE, draws[0])
         assert state.errors is not None
         heights = 0.35 + 0.01 * outcome.obs[:, :4]
-        np.testing.assert_allclose(heights, 0.35 + changes(robot), atol=1e-7)
+        commanded = joint_angles(robot, 0.35 + changes(robot))
+        read = foot_heights(robot, commanded + state.errors.readings)
+        np.testing.assert_allclose(heights, read, atol=1e-7)
+        assert np.abs(read - 0.35 - changes(robot)).max() > 0.001
         true = moved["joints"]
-        wanted = joint_angles(robot, 0.35 + changes(robot)) - state.errors.encoders
+        wanted = commanded - state.errors.encoders
         np.testing.assert_allclose(true[:, -1], wanted, atol=1e-9)
         assert np.abs(foot_heights(robot, true[:, -1]) - heights).max() > 0.002
         # It starts where it stands, and is there at the end of the first decision.
