@@ -106,6 +106,15 @@ def test_where_no_row_is_finite_none_is_stored() -> None:
     assert got.metrics["reward"].number[0] == 0
 
 
+def test_envs_that_all_diverge_leave_the_replay_as_it_is(make: Callable[..., DQN]) -> None:
+    dqn = make(probes.Faulty({"obs": math.inf}, 1.0))
+    before = dqn.init(0)
+    after, metrics = dqn.train_program(3)(before)
+    assert metrics["diverged"] == 1
+    assert after.replay.size.sum() == 0
+    assert_finite(learnt(after))
+
+
 def test_an_env_may_report_its_own_divergence_and_need_not_end_then() -> None:
     """One of five reports it, two have a reward that is not finite; none says that it is done."""
 
