@@ -22,7 +22,7 @@ class EvaluateArgs(ControllerArgs):
     """Evaluate a policy in plain MuJoCo on all cores. Needs no JAX."""
 
     suite: str = "paper"
-    """Kind of scenarios: paper, corner, noise, payload, friction, gains, latency, push, fast,
+    """Kind of scenarios: paper, corner, noise, payload, friction, gains, soft, latency, push, fast,
     steep, recover, steps, sea, platform, bias, encoder, delay or dropout."""
     scenarios: int = 256
     """Number of scenarios."""
