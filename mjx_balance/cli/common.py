@@ -54,7 +54,7 @@ class ControllerArgs:
     menagerie:NAME."""
     action: Literal["grid", "continuous"] | None = None
     """Command height changes of the grid, or any up to its greatest; none: as the policy was
-    trained, and the grid for a baseline."""
+    trained, and any for a baseline."""
 
     def load(self) -> tuple[Scene, Controller]:
         """Loads the policy or builds the baseline, and its scene.

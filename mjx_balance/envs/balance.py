@@ -56,13 +56,13 @@ class BalanceEnv(Env):
           config: the preset "default" if none; `robots.limits.for_robot` makes
             another robot's.
           action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
-            `action_max`, -1 to 1; None: as `config.task.action`.
+            `action_max`, -1 to 1; None: as `config.task.action`, discrete without a config.
 
         Raises:
           ConfigError: if the config cannot be run, or for another kind of action.
         """
         self.config = check(config or preset("default"))
-        self._discrete = check_action(action, self.config.task) == "discrete"
+        self._discrete = check_action(action, config and config.task) == "discrete"
         self.scene = load_scene(self.config)
         self.engine = make_engine(self.config, self.scene)
         self._table = action_table(self.config.task)

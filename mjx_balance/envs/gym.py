@@ -64,7 +64,7 @@ class _Balance:
           preset: name of the config; "default" if neither is given.
           config: instead of preset and robot; its task, robot and randomisation count.
           action: "discrete", the paper's grid, or "continuous", a_x and a_y as shares of
-            `action_max`, -1 to 1; None: as the config's `task.action`.
+            `action_max`, -1 to 1; None: as the given config's `task.action`, discrete without.
           render_mode: "human", a window in which every decision takes its time (one env only);
             "rgb_array"; or None.
           robot: as `Config.robot`, for which the preset is adapted; our own if None.
@@ -87,7 +87,7 @@ class _Balance:
         task = self.config.task
         self.max_episode_steps = task.episode_length
         self.metadata = self.metadata | {"render_fps": 1 / task.ctrl_dt}
-        discrete = check_action(action, task) == "discrete"
+        discrete = check_action(action, config and config.task) == "discrete"
         self._table = action_table(task) if discrete else None
         shares = spaces.Box(-1, 1, (2,), np.float32)
         single = shares if self._table is None else spaces.Discrete(len(self._table))

@@ -11,10 +11,14 @@ from mjx_balance.text import quote
 ACTIONS = ("discrete", "continuous")  #: table index; shares of `action_max`, -1 to 1
 
 
-def check_action(kind: str | None, task: TaskConfig) -> str:
-    """Returns one of `ACTIONS`, for None that of `task.action`; raises `ConfigError` for others."""
+def check_action(kind: str | None, task: TaskConfig | None) -> str:
+    """Returns one of `ACTIONS`; raises `ConfigError` for other words.
+
+    None is that of `task.action`; without a task, discrete: the spaces of an env that is made by
+    name alone are the paper's.
+    """
     if kind is None:
-        return ACTIONS[task.action == "continuous"]
+        return ACTIONS[task is not None and task.action == "continuous"]
     if kind not in ACTIONS:
         raise ConfigError(f"action is {quote(kind)}; it must be one of {', '.join(ACTIONS)}")
     return kind

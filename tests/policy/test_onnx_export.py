@@ -49,8 +49,7 @@ def make_policy(name: str) -> Policy:
         return load_policy(SHIPPED)
     config = with_head(preset("best"), name if name in HEADS else "radial")
     if name not in HEADS:
-        task = dataclasses.replace(config.task, action="continuous", action_max=0.004)
-        config = dataclasses.replace(config, task=task)
+        config = with_head(preset("best"), "radial", action="continuous", action_max=0.004)
     manifest = make_manifest(config, "0" * 16, {"seed": 5})
     return Policy(manifest, flat_weights(random_params(config)))
 

@@ -89,7 +89,7 @@ def test_the_manifest_of_the_preset_best_by_hand() -> None:
     timing = {"sample_s": 0.004, "decision_samples": 50, "ramp_samples": 5}
     assert manifest["timing"] == timing
     assert (manifest["body_height_m"], manifest["fail_tilt_deg"]) == (0.35, 6.0)
-    assert manifest["action"] == "grid"
+    assert manifest["action"] == "continuous"
     assert manifest["network"] == {"hidden_sizes": [64, 64], "factors": [21, 21], "radial": True}
     assert [leg["name"] for leg in manifest["robot"]["legs"]] == ["LF", "RF", "LH", "RH"]
 

@@ -327,9 +327,9 @@ def test_the_config_table_shows_what_differs_from_the_papers() -> None:
     assert json.loads(html.unescape(everything)) == to_dict(config)
 
 
-def test_the_commands_make_everything_again(policy: Policy, config: Config) -> None:
+def test_the_commands_make_everything_again(policy: Policy) -> None:
     runs = [
-        Run(Path("a"), config=config, policy=policy),
+        Run(Path("a"), config=preset("default"), policy=policy),
         Run(Path("b b"), policy=policy),
         Run(Path("c")),
     ]
