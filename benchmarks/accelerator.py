@@ -81,8 +81,8 @@ def rates(engine: str, sizes: list[int]) -> Iterator[Row]:
         fields = {"engine": engine, "num_envs": num_envs, "num_devices": None, "num_seeds": 1}
         config, learner = throughput.make_learner(load_policy(POLICY).config, **fields)
 
-        def act(obs: Any, network: Any = learner.network) -> Any:
-            return network.apply({"params": params}, obs, method="head").argmax()
+        def act(obs: Any, head: Any = learner.head) -> Any:
+            return head({"params": params}, obs).argmax()
 
         iterations = iterations_of(num_envs)
         start = learner.init(0).env_state, jax.random.PRNGKey(0)

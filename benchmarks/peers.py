@@ -64,7 +64,7 @@ def train_sb3(report: Callable[..., None], decisions: int, every: int) -> None:
     torch.set_num_threads(1)  # faster than two with layers of this size
     model = DQN(
         "MlpPolicy",
-        BalanceGymEnv(config=config),
+        BalanceGymEnv(config=config, action="discrete"),
         learning_rate=1e-3,
         buffer_size=config.dqn.replay_capacity,
         learning_starts=1_000,

@@ -82,7 +82,8 @@ def suite_result(
         again, before = measure(bar, few)["mean_of_first"], old["mean_of_first"]
         return abs(again[str(few)] - before[str(few)]) < SAME_DEG
 
-    key = f"{name}, ramp {policy.config.task.action_ramp}, {suite}, {scenarios} x {DURATION:g} s"
+    task = policy.config.task
+    key = f"{name}, {task.action}, ramp {task.action_ramp}, {suite}, {scenarios} x {DURATION:g} s"
     key += f", seed {SEEDS.held_out}"
     return cached(out, key, scene, f"{name}, {suite}, {scenarios} scenarios", measure, same)
 

@@ -100,14 +100,18 @@ def training_program(
 def env_program(learner: DQN, iterations: int, act: Callable[..., Any] | None = None) -> Any:
     """The env alone, done envs reset as in training: (env state, key) -> (the same, nothing).
 
-    `act` maps observations (n, obs_size) to actions (n,); they are random if none.
+    `act` maps observations (n, obs_size) to actions; they are random if none.
     """
     env = learner.env
 
+    def random(key: Any, count: int) -> Any:
+        if learner.spec.continuous:
+            return jax.random.uniform(key, (count, env.action_size), jnp.float32, -1, 1)
+        return jax.random.randint(key, (count,), 0, env.action_size)
+
     def step(state: Any, key: Any) -> Any:
         key_act, key_reset = jax.random.split(device_key(key))
-        random = jax.random.randint(key_act, state.reward.shape, 0, env.action_size)
-        action = random if act is None else act(state.obs)
+        action = random(key_act, len(state.reward)) if act is None else act(state.obs)
         return reset_done(env.reset, jax.vmap(env.step)(state, action), key_reset), None
 
     def program(state_and_key: Any) -> Any:
