@@ -68,7 +68,7 @@ def test_a_continuous_action_on_the_grid_does_what_its_index_does(env: BalanceEn
     shares = jnp.stack(jnp.divmod(index, 21), axis=-1) / 10 - 1
     start = jax.vmap(env.reset)(keys(len(index)))
     ours = jax.jit(jax.vmap(env.step))(start, shares)
-    theirs = jax.jit(jax.vmap(BalanceEnv(env.config).step))(start, index)
+    theirs = jax.jit(jax.vmap(BalanceEnv(env.config, "discrete").step))(start, index)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-4), ours, theirs)
     heights = ours.pipeline_state.memory.heights
     assert float(jnp.ptp(heights)) == pytest.approx(4 * env.config.task.action_max, rel=1e-5)

@@ -65,7 +65,7 @@ def test_braxs_evaluation_wrapper_scans(config: Config) -> None:
 
 @pytest.mark.slow  # two compilations
 def test_64_bits_change_no_number(config: Config) -> None:
-    env = BalanceEnv(config)
+    env = BalanceEnv(config, "discrete")
 
     def roll(key: jax.Array) -> Any:
         state = env.reset(key)

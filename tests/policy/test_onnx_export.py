@@ -1,6 +1,5 @@
 """The ONNX model: what NumPy computes, under onnxruntime; written whole or not at all."""
 
-import dataclasses
 import json
 import os
 import sys

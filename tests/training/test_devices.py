@@ -164,7 +164,8 @@ def test_impossible_sizes_are_refused(config: Any, sentence: str) -> None:
 )
 def test_the_learner_is_the_configs(head: Any, factors: tuple[int, ...]) -> None:
     sizes = {"num_envs": 32, "num_devices": 1, "num_env_steps": 320, "num_seeds": 3}
-    config = with_batch(16, head=head, hidden_sizes=(8, 4), **sizes)
+    task = dataclasses.replace(CONFIG.task, action="continuous" if head == "radial" else "grid")
+    config = with_batch(16, head=head, hidden_sizes=(8, 4), task=task, **sizes)
     env = BalanceEnv(config)
     learner = make_learner(config, env)
     network = learner.network
