@@ -193,7 +193,8 @@ def test_who_diverges_falls_alone(fleet: Any, closed_loop: list[Any], value: flo
     jax.tree.map(check, clean, got)
     assert got.done[3] == got.metrics["fall"][3] == got.metrics["diverged"][3] == 1
     assert got.info["truncation"][3] == 0
-    for array in (got.obs, got.reward, *jax.tree.leaves(got.metrics), *got.pipeline_state.memory):
+    memory = jax.tree.leaves(got.pipeline_state.memory)
+    for array in (got.obs, got.reward, *jax.tree.leaves(got.metrics), *memory):
         assert np.isfinite(array).all()
     assert got.metrics["tilt_deg"][3] == 6
     toward = max((before.metrics["tilt_deg"][3] - 6) / 2.5, -1)
@@ -219,8 +220,8 @@ def uniform(values: np.ndarray, low: float, high: float) -> bool:
 
 def test_targets_fill_the_disc_as_the_paper_says(config: Config) -> None:
     """Any direction, total tilt uniform up to 7 deg; the board starts level, at any age."""
-    targets, phase, rate, waves = scenarios(config, 30.0, 0.0)
-    assert waves is None
+    targets, phase, rate, waves, start = scenarios(config, 30.0, 0.0)
+    assert waves is start is None
     assert targets.shape == (RESETS, 4, 2)
     assert not targets[:, 0].any()
     assert uniform(phase, 0, 10)

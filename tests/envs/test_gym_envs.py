@@ -256,8 +256,9 @@ def test_boards_are_those_of_training(
 ) -> None:
     rngs = [np.random.default_rng(k) for k in range(1500)]
     own = short(config, 300, square_share=share)
-    targets, phase, rate, waves = draw_episodes(own.task, own.randomization, robot, rngs).scenario
-    assert waves is None
+    scenario = draw_episodes(own.task, own.randomization, robot, rngs).scenario
+    targets, phase, rate, waves, start = scenario
+    assert waves is start is None
     assert targets.shape == (1500, 7, 2)  # 60 s, whatever the phase
     assert not targets[:, 0].any()
     # x^2 of a disc's uniform radius of 7 deg: 49 / 3 / 2; of a square's side: 49 / 3.

@@ -25,7 +25,7 @@ COPIES: list[Callable[[Any], Any]] = [copy.deepcopy, lambda env: pickle.loads(pi
 def config() -> Config:
     """Sensor noise, payloads, delays and pushes; episodes of 7 decisions."""
     config = preset("best")
-    task = dataclasses.replace(config.task, episode_length=7)
+    task = dataclasses.replace(config.task, action="grid", episode_length=7)
     ranges = dataclasses.replace(config.randomization, payload=5.0, latency_share=0.5)
     return dataclasses.replace(config, task=task, randomization=ranges)
 

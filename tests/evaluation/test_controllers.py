@@ -109,7 +109,10 @@ def test_gains_are_those_that_the_benchmark_found_best(scene: Scene) -> None:
 
 
 def test_complementary_filter_sample_by_sample(scene: Scene) -> None:
-    """Predict by the gyro, lean toward gravity's direction; worlds keep their own angle."""
+    """Predict by the gyro, lean toward gravity's direction; worlds keep their own angle.
+
+    It begins with the direction of the first sample.
+    """
     rng = np.random.default_rng(0)
     controller = ImuPD(scene, tau=0.5, samples=3)
     angle, leak = np.zeros((3, 2)), 0.004 / 0.504
@@ -119,6 +122,8 @@ def test_complementary_filter_sample_by_sample(scene: Scene) -> None:
         accel = down.apply((0, 0, 9.81)).reshape(len(ids), 50, 3)
         gyro = rng.uniform(-1, 1, (len(ids), 50, 3))
         for row, world in enumerate(ids):
+            if decision == 0:
+                angle[world] = np.radians(lean[row, 0])
             for k in range(50):
                 predicted = angle[world] + 0.004 * gyro[row, k, :2]
                 angle[world] = predicted + leak * (np.radians(lean[row, k]) - predicted)
