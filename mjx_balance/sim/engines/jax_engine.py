@@ -32,8 +32,8 @@ class JaxEngine:
     def initial(self, qpos: Float[jax.Array, " nq"] | None = None) -> PhysicsState:
         """At rest in the settled stance, or elsewhere."""
         stance = self.scene.stance
-        qpos = stance.qpos if qpos is None else qpos
-        parts = (qpos, stance.qvel, stance.qacc_warmstart)
+        start = stance.qpos if qpos is None else qpos
+        parts = (start, stance.qvel, stance.qacc_warmstart)
         return PhysicsState(*(jnp.asarray(part, jnp.float32) for part in parts))
 
     def push(self, physics: PhysicsState, velocity: Float[jax.Array, "2"]) -> PhysicsState:
