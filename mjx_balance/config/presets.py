@@ -12,7 +12,7 @@ from mjx_balance.config.schema import (
 )
 
 _LAST_600_MS = tuple(range(0, 150, 5))
-# Off the grid the same network has half the tilt (benchmarks/README.md).
+# The grid adds some 40% to 75% to the mean tilt of the same network (docs/how_it_works.md).
 _TASK = TaskConfig(
     square_share=0.5,
     action="continuous",
