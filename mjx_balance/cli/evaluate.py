@@ -23,7 +23,8 @@ class EvaluateArgs(ControllerArgs):
 
     suite: str = "paper"
     """Kind of scenarios: paper, corner, noise, payload, friction, gains, soft, latency, push, fast,
-    steep, recover, steps, sea, platform, bias, encoder, delay or dropout."""
+    steep, recover, steps, sea, platform, bias, encoder, delay, dropout, load, slip or
+    weak."""
     scenarios: int = 256
     """Number of scenarios."""
     duration: float = 60.0

@@ -204,6 +204,12 @@ class RandomizationConfig:
     """Greatest sliding friction of the feet; none: the robot's foot_friction."""
     gain_spread: Annotated[float, Ge(0), Lt(1)] = 0.0
     """Greatest relative deviation of the servo gains."""
+    event_payload: NonNegative = 0.0
+    """Greatest mass on the trunk from the middle of an episode on, kg; 0: the load stays."""
+    event_grip: Annotated[float, Gt(0), Le(1)] = 1.0
+    """Least share of its friction that one foot keeps from the middle of an episode on."""
+    event_strength: Annotated[float, Gt(0), Le(1)] = 1.0
+    """Least share of its stiffness that one leg servo keeps from then on."""
     latency_share: Share = 0.0
     """Share of the envs with an action delay of one decision."""
     push_min: NonNegative = 0.0
@@ -214,9 +220,14 @@ class RandomizationConfig:
     """Time between pushes, s (chosen)."""
 
     @property
+    def happens(self) -> bool:
+        """Whether something changes in the middle of an episode, besides pushes."""
+        return self.event_payload > 0 or min(self.event_grip, self.event_strength) < 1
+
+    @property
     def varies(self) -> bool:
         """Whether envs differ; the payload's offset and height matter only with a payload."""
-        shares = self.gain_spread, self.latency_share, self.sensors_err
+        shares = self.gain_spread, self.latency_share, self.sensors_err, self.happens
         sizes = self.gyro_noise, self.accel_noise, self.payload, self.push_max
         return any((*shares, *sizes)) or (self.friction_min, self.friction_max) != (None, None)
 

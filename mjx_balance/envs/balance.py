@@ -10,6 +10,7 @@ from brax.envs.base import Env, State
 from mjx_balance.config import ACTION_AXES, Config, check, preset
 from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.sim.scene import load_scene
+from mjx_balance.task import events
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.observation import input_rows
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
@@ -99,9 +100,10 @@ class BalanceEnv(Env):
     def reset(self, rng: jax.Array) -> State:
         """Starts a fresh tilt scenario from the settled stance, by a PRNG key."""
         task, robot, scene = self.config.task, self.scene.robot, self.scene
-        ranges, params, pushes, errors = self.config.randomization, None, None, None
+        ranges, params, pushes = self.config.randomization, None, None
+        errors, event = None, None
         # No key depends on how many are split off: pushes change no other draw.
-        rng, key_params, key_noise, key_pushes, key_errors = jax.random.split(rng, 5)
+        rng, key_params, key_noise, key_pushes, key_errors, key_event = jax.random.split(rng, 6)
         info = {
             "episode_length": jnp.int32(task.episode_length),
             "truncation": jnp.float32(0.0),
@@ -113,6 +115,9 @@ class BalanceEnv(Env):
         if ranges.sensors_err:
             draws = jax.random.uniform(key_errors, (count_draws(robot),), jnp.float32)
             errors = draw_errors(ranges, robot, draws)
+        if ranges.happens and params is not None:
+            draws = jax.random.uniform(key_event, (events.DRAWS,), jnp.float32)
+            event = events.draw_event(ranges, robot, params, task.episode_length, draws)
         due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
         if len(due):
             draws = jax.random.uniform(key_pushes, (len(due), 2), jnp.float32)
@@ -132,6 +137,7 @@ class BalanceEnv(Env):
             params=params,
             pushes=pushes,
             errors=errors,
+            event=event,
         )
         angles = start.physics.qpos[scene.leg_qpos]
         if errors is not None:

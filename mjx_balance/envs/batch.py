@@ -10,6 +10,7 @@ from mjx_balance.config import RandomizationConfig, TaskConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.sim.engines.mujoco import MujocoEngine
 from mjx_balance.sim.scene import Scene
+from mjx_balance.task import events
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
 from mjx_balance.task.sensors import (
@@ -33,6 +34,7 @@ class Episodes(NamedTuple):
     pushes: Pushes | None = None  #: None: no pushes
     rngs: Sequence[np.random.Generator] = ()  #: of each episode, for its sensors
     errors: SensorErrors | None = None  #: None: sensors are right, but for noise
+    event: events.Event | None = None  #: None: nothing changes in the middle of an episode
 
 
 def draw_episodes(
@@ -50,7 +52,7 @@ def draw_episodes(
       rngs: of each episode; the noise of its sensors comes from it, too.
     """
     due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
-    params, pushes, errors = None, None, None
+    params, pushes, errors, event = None, None, None, None
     scenarios = [draw_scenario(task, numpy_uniform(rng)) for rng in rngs]
     if ranges.varies:
         params = draw_params(ranges, robot, np.stack([rng.uniform(size=DRAWS) for rng in rngs]))
@@ -60,7 +62,10 @@ def draw_episodes(
     if ranges.sensors_err:
         count = count_draws(robot)
         errors = draw_errors(ranges, robot, np.stack([rng.uniform(size=count) for rng in rngs]))
-    return Episodes(stacked(scenarios), params, pushes, rngs, errors)
+    if ranges.happens and params is not None:
+        uniform = np.stack([rng.uniform(size=events.DRAWS) for rng in rngs])
+        event = events.draw_event(ranges, robot, params, task.episode_length, uniform)
+    return Episodes(stacked(scenarios), params, pushes, rngs, errors, event)
 
 
 class BatchEnv:
@@ -91,8 +96,8 @@ class BatchEnv:
         self._engine.reset(ids, start.qpos)
         memory = initial_memory(self.task, self.scene.robot, still, tilt, episodes.errors)
         env_steps = np.zeros(len(ids), int)
-        scenario, params, pushes, _, errors = episodes
-        state = EnvState(ids, memory, scenario, env_steps, params, pushes, errors)
+        scenario, params, pushes, _, errors, event = episodes
+        state = EnvState(ids, memory, scenario, env_steps, params, pushes, errors, event)
         return _tree_map(np.array, state)  # a copy, which may be written to
 
     def _observe_start(self, state: EnvState) -> np.ndarray:

@@ -12,7 +12,7 @@ from mjx_balance.envs.batch import Episodes, stacked
 from mjx_balance.errors import InputError
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import authority, check_delays, greatest_incline, scale_ranges
-from mjx_balance.task import tilt
+from mjx_balance.task import events, tilt
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, draw_params
 from mjx_balance.task.sensors import count_draws, draw_errors
@@ -81,6 +81,10 @@ SUITES: dict[str, Suite] = {
         )
     ),
     "dropout": Suite(RandomizationConfig(dropout=0.1)),  # every tenth IMU sample is lost
+    # From a fifth to three fifths of the scenario on:
+    "load": Suite(RandomizationConfig(event_payload=5.0)),  # as `payload`, laid on
+    "slip": Suite(RandomizationConfig(event_grip=0.1)),  # one foot keeps 10 to 100% of its friction
+    "weak": Suite(RandomizationConfig(event_strength=0.2)),  # one servo 20 to 100% of its stiffness
 }
 """By the names of `mjx-balance evaluate --suite`."""
 HEADLINE = ("paper", "corner")  #: evaluated after training, in reports and tables
@@ -113,8 +117,8 @@ def draw_suite(
     """Draws a suite's episodes, each of `duration` s.
 
     Scenario k of a seed is the same however many are drawn. Ramps, sensor noise, pushes, other
-    motions, starts and sensor errors come from generators of their own, told apart by their last
-    number.
+    motions, starts, sensor errors and events come from generators of their own, told apart by their
+    last number.
 
     Raises:
       ConfigError: if the sea of the config is out of bounds, or a decision shorter than the delays.
@@ -152,6 +156,12 @@ def draw_suite(
         own = [np.random.default_rng((seed, k, 5)) for k in range(scenarios)]
         numbers = np.asarray([rng.uniform(size=count_draws(robot)) for rng in own])
         errors = draw_errors(ranges, robot, numbers)
+    params = draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None
+    event = None
+    if ranges.happens and params is not None:
+        own = [np.random.default_rng((seed, k, 6)) for k in range(scenarios)]
+        numbers = np.asarray([rng.uniform(size=events.DRAWS) for rng in own])
+        event = events.draw_event(ranges, robot, params, round(duration / task.ctrl_dt), numbers)
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     if chosen.motion is not None:
         draw = tilt.MOTIONS[chosen.motion]
@@ -166,10 +176,11 @@ def draw_suite(
         scenario = scenario._replace(start=start)
     return Episodes(
         scenario=scenario,
-        params=draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None,
+        params=params,
         pushes=_draw_pushes(task, ranges, scenarios, duration, seed),
         rngs=[np.random.default_rng((seed, k, 1)) for k in range(scenarios)],
         errors=errors,
+        event=event,
     )
 
 

@@ -33,7 +33,8 @@ def scale_ranges(ranges: RandomizationConfig, robot: Robot) -> RandomizationConf
     """Scales payloads with the robot's mass, their offsets and push speeds with its size."""
     lengths = ("payload_offset", "payload_height", "push_min", "push_max")
     sizes = {name: getattr(ranges, name) * robot.size_scale for name in lengths}
-    return dataclasses.replace(ranges, payload=ranges.payload * robot.mass_scale, **sizes)
+    masses = {n: getattr(ranges, n) * robot.mass_scale for n in ("payload", "event_payload")}
+    return dataclasses.replace(ranges, **masses, **sizes)
 
 
 def greatest_incline(task: TaskConfig, robot: Robot) -> float:

@@ -21,15 +21,16 @@ def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
     left out. Fields have the leading axes of the parameters.
     """
     model, trunk, xp = scene.model, scene.trunk, params.payload.__array_namespace__()
-    legs = scene.leg_ctrl.ravel()
+    legs, feet = scene.leg_ctrl.ravel(), scene.foot_pairs
     load, at = params.payload[..., None], params.payload_at
     mass, centre = model.body_mass[trunk], model.body_ipos[trunk]
     moved = (mass * centre + load * at) / (mass + load)
     arm = (at - centre) @ _principal(model, trunk)
     spread = xp.sum(arm**2, axis=-1, keepdims=True) - arm**2
     inertia = model.body_inertia[trunk] + mass * load / (mass + load) * spread
-    friction = params.friction[..., None, None] * np.ones((model.npair, 2))
-    stiffness = model.actuator_gainprm[legs, 0] * params.gain[..., None]
+    friction = params.friction[..., None] * np.ones(2)
+    gain = params.gain.reshape(*params.payload.shape, -1)
+    stiffness = model.actuator_gainprm[legs, 0] * gain
 
     def put(field: np.ndarray, where: tuple[Any, ...], value: Array) -> Array:
         base = xp.zeros((*value.shape[: params.payload.ndim], *field.shape)) + field
@@ -47,7 +48,7 @@ def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
         "dof_invweight0": of_dofs,
         "actuator_gainprm": put(model.actuator_gainprm, (legs, 0), stiffness),
         "actuator_biasprm": put(model.actuator_biasprm, (legs, 1), -stiffness),
-        "pair_friction": put(model.pair_friction, (slice(None), slice(0, 2)), friction),
+        "pair_friction": put(model.pair_friction, (feet, slice(0, 2)), friction),
     }
 
 

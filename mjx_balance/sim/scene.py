@@ -67,6 +67,7 @@ class Layout:
     trunk: int  #: id of the trunk's body
     leg_qpos: Int[np.ndarray, "legs 3"]  #: of the leg joints in qpos
     leg_ctrl: Int[np.ndarray, "legs 3"]  #: of the leg servos in ctrl
+    foot_pairs: Int[np.ndarray, " legs"]  #: contact pairs of the feet
     board_qpos: Int[np.ndarray, "2"]  #: of the board hinges, X and Y, in qpos
     board_ctrl: Int[np.ndarray, "2"]  #: of the board servos in ctrl
     platform_qpos: Int[np.ndarray, " slides"]  #: of surge, sway and heave in qpos, if there are any
@@ -245,6 +246,7 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
         trunk=trunk.id,
         leg_qpos=ids([[model.joint(n).qposadr[0] for n in leg] for leg in names]),
         leg_ctrl=ids([[model.actuator(n).id for n in leg] for leg in names]),
+        foot_pairs=ids([model.pair(f"{leg.name}_contact").id for leg in robot.legs]),
         board_qpos=ids([model.joint(n).qposadr[0] for n in board]),
         board_ctrl=ids([model.actuator(n).id for n in board]),
         platform_qpos=ids([model.joint(n).qposadr[0] for n in slides]),

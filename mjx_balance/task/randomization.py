@@ -18,8 +18,8 @@ class DomainParams(NamedTuple):
     imu_noise: Float[Array, "*batch 6"]  #: standard deviation of every IMU sample, rad/s and m/s^2
     payload: Float[Array, "*batch"]  #: mass carried on the trunk, kg
     payload_at: Float[Array, "*batch 3"]  #: where, in the trunk's frame, m
-    friction: Float[Array, "*batch"]  #: sliding friction of the feet
-    gain: Float[Array, "*batch"]  #: factor on the leg servos' position gain
+    friction: Float[Array, "*batch legs"]  #: sliding friction of every foot
+    gain: Float[Array, "*batch legs 3"]  #: factor on the position gain of every leg servo
     delay: Float[Array, "*batch"]  #: decisions between choosing an action and taking it, 0 or 1
 
 
@@ -34,11 +34,14 @@ def draw_params(
     at = offset * (2 * u[1] - 1), offset * (2 * u[2] - 1), 0 * u[0] + ranges.payload_height
     friction_min = robot.foot_friction if ranges.friction_min is None else ranges.friction_min
     friction_max = robot.foot_friction if ranges.friction_max is None else ranges.friction_max
+    legs = np.ones(len(robot.legs), uniform.dtype)
     return DomainParams(
         imu_noise=xp.zeros_like(u[0])[..., None] + sigma,
         payload=ranges.payload * u[0],
         payload_at=xp.stack(at, axis=-1),
-        friction=friction_min + (friction_max - friction_min) * u[3],
-        gain=1 + ranges.gain_spread * (2 * u[4] - 1),
+        friction=(friction_min + (friction_max - friction_min) * u[3])[..., None] * legs,
+        gain=(1 + ranges.gain_spread * (2 * u[4] - 1))[..., None, None]
+        * legs[:, None]
+        * np.ones(3, uniform.dtype),
         delay=(u[5] < ranges.latency_share).astype(uniform.dtype),
     )

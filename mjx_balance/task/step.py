@@ -16,6 +16,7 @@ from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import delay_steps
 from mjx_balance.task import Array, kinematics, tilt
 from mjx_balance.task.actions import apply_action
+from mjx_balance.task.events import Event, params_now
 from mjx_balance.task.means import Means, start_means, update_means
 from mjx_balance.task.observation import (
     Signals,
@@ -97,6 +98,7 @@ class EnvState(NamedTuple):
     params: DomainParams | None  #: None: the nominal model, no sensor noise, no action delay
     pushes: Pushes | None
     errors: SensorErrors | None = None  #: None: sensors and commands are right, but for `params`
+    event: Event | None = None  #: None: `params` stay
 
 
 class Outcome(NamedTuple):
@@ -133,6 +135,8 @@ def step(
     if errors is not None:
         joints = servo_targets(errors, state.env_steps, targets.joints)
         targets = targets._replace(joints=joints)
+    if state.event is not None and params is not None:
+        params = params_now(state.event, params, state.env_steps)
     if state.pushes is not None:
         physics = engine.push(physics, push_velocity(state.pushes, state.env_steps))
     physics, motion = engine.advance(physics, targets, params)

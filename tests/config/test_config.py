@@ -181,6 +181,8 @@ BOUNDS: list[tuple[str, tuple[Any, ...], tuple[Any, ...]]] = [
     ("sensor_delay sensor_jitter command_delay command_jitter", (0.0, 0.1), (-0.1,)),
     ("encoder_offset reading_offset", (0.0, 0.1), (-0.1,)),
     ("imu_tilt", (0.0, 0.5), (-0.1, 0.51)),
+    ("event_payload", (0.0, 5.0), (-0.1,)),
+    ("event_grip event_strength", (0.01, 1.0), (0.0, -0.1, 1.01)),
     ("imu_scale dropout", (0.0, 0.9), (-0.1, 1.0)),
     ("friction_min friction_max", (None, 0.8), (0.0, -0.5)),
     ("gain_spread", (0.0, 0.9), (1.0, -0.01)),

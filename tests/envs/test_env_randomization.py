@@ -39,8 +39,8 @@ def test_domain_parameters_fill_their_ranges(drawn: tuple[DomainParams, Any, np.
         "payload": (params.payload, 0, 5),
         "x": (params.payload_at[:, 0], -0.05, 0.05),
         "y": (params.payload_at[:, 1], -0.05, 0.05),
-        "friction": (params.friction, 0.4, 1.0),
-        "gain": (params.gain, 0.8, 1.2),
+        "friction": (params.friction[:, 1], 0.4, 1.0),
+        "gain": (params.gain[:, 2, 1], 0.8, 1.2),
         "speed": (np.linalg.norm(pushes[:, 2], axis=-1), 0.05, 0.1),
         "direction": (np.arctan2(pushes[:, 0, 1], pushes[:, 0, 0]), -np.pi, np.pi),
     }
@@ -62,8 +62,8 @@ def test_no_two_draws_of_an_env_go_together(drawn: tuple[DomainParams, Any, np.n
         (
             params.payload,
             params.payload_at[:, :2],
-            params.friction,
-            params.gain,
+            params.friction[:, 0],
+            params.gain[:, 0, 0],
             params.delay,
             scenario.targets[:, 1],
             np.linalg.norm(scenario.targets[:, 1], axis=-1),

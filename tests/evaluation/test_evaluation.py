@@ -72,9 +72,9 @@ def held_boards(config: Config, targets: Any, duration: float) -> Scenario:
 
 def nominal(count: int) -> DomainParams:
     """Parameters that change nothing."""
-    zero, one = np.zeros(count), np.ones(count)
+    zero, friction, gain = np.zeros(count), np.full((count, 4), 0.8), np.ones((count, 4, 3))
     noise, at = np.zeros((count, 6)), np.zeros((count, 3))
-    return DomainParams(noise, zero, at, friction=0.8 * one, gain=one, delay=zero)
+    return DomainParams(noise, zero, at, friction, gain, delay=zero)
 
 
 def tilts(scene: Scene, qpos: np.ndarray) -> np.ndarray:
@@ -172,7 +172,7 @@ def test_rollout_is_what_a_loop_of_single_steps_gives(
     conditions = nominal(2)._replace(
         payload=np.asarray((0.0, 3.0)),
         payload_at=np.asarray([(0, 0, 0), (0, 0, 0.1)]),
-        gain=np.asarray((1.0, 0.85)),
+        gain=np.asarray((1.0, 0.85))[:, None, None] * np.ones((4, 3)),
         delay=np.asarray((0.0, 1.0)),
     )
     singles = [ByHand(scene, 1.0, 0.0, 0.0, False), ByHand(scene, 0.85, 3.0, 0.1, True)]
@@ -625,7 +625,7 @@ def test_a_payload_off_the_centre_bends_the_legs_under_it(config: Config, scene:
 
 def test_feet_slide_where_friction_is_low(config: Config, scene: Scene) -> None:
     """4.5 degrees hold with friction 0.4 and not with 0.05: the robot slides downhill."""
-    icy = nominal(2)._replace(friction=np.asarray((0.4, 0.05)))
+    icy = nominal(2)._replace(friction=np.asarray(((0.4,) * 4, (0.05,) * 4)))
     episodes = Episodes(held_boards(config, [(0.0, 4.5)] * 2, 4.0), icy)
     rollout = roll_out(scene, always(STAND), episodes, 4.0, record=True)
     x = np.abs(rollout.qpos[:, -1, scene.trunk_quat[0] - 3])

@@ -71,8 +71,8 @@ def test_circumstances_by_their_draws(config: Config) -> None:
     np.testing.assert_allclose(payload.payload, 5 * others[:, 0])
     np.testing.assert_allclose(payload.payload_at[:, 0], 0.1 * others[:, 1] - 0.05)
     np.testing.assert_allclose(payload.payload_at[:, 1], 0.1 * others[:, 2] - 0.05)
-    np.testing.assert_allclose(friction.friction, 0.4 + 0.6 * others[:, 3])
-    np.testing.assert_allclose(gains.gain, 0.8 + 0.4 * others[:, 4])
+    np.testing.assert_allclose(friction.friction[:, 3], 0.4 + 0.6 * others[:, 3])
+    np.testing.assert_allclose(gains.gain[:, 3, 2], 0.8 + 0.4 * others[:, 4])
     noise = draw(config, "noise", 2, 60.0, 2).rngs
     own = [np.random.default_rng((2, k, 1)).normal() for k in range(2)]
     assert [rng.normal() for rng in noise] == own, "from generators of their own"
@@ -260,7 +260,7 @@ def test_impossible_wishes_are_refused(config: Config) -> None:
         draw(config, "paper", 1, 10, -1)
     names = (
         "paper, corner, noise, payload, friction, gains, soft, latency, push, fast, steep, "
-        "recover, steps, sea, platform, bias, encoder, delay, dropout"
+        "recover, steps, sea, platform, bias, encoder, delay, dropout, load, slip, weak"
     )
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
         draw(config, "moon", 1, 10, 0)

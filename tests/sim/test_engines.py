@@ -271,8 +271,8 @@ def test_domain_parameters_are_those_of_models_made_so(scene: Scene) -> None:
         imu_noise=np.zeros((2, 6)),
         payload=np.asarray((3.0, 5.0)),
         payload_at=np.asarray(((0.0, 0.0, 0.1), (0.05, -0.04, 0.08))),
-        friction=np.asarray((0.5, 0.9)),
-        gain=np.asarray((0.85, 1.1)),
+        friction=np.asarray(((0.5, 0.6, 0.7, 0.8), (0.9, 0.4, 0.9, 0.9))),
+        gain=np.linspace(0.7, 1.1, 24).reshape(2, 4, 3),
         delay=np.zeros(2),
     )
     engine = MujocoEngine(scene, 2, threads=1)
@@ -301,7 +301,7 @@ def test_domain_parameters_are_those_of_models_made_so(scene: Scene) -> None:
 
 
 def loaded_model(
-    scene: Scene, load: float, at: np.ndarray, friction: float, gain: float
+    scene: Scene, load: float, at: np.ndarray, friction: np.ndarray, gain: np.ndarray
 ) -> mujoco.MjModel:
     """A robot that carries a small heavy body, from the scene's files."""
     stage, board, body = (
@@ -313,17 +313,17 @@ def loaded_model(
     carried.explicitinertial = True
     stage.attach(board, prefix="board/", frame=stage.worldbody.add_frame())
     stage.attach(body, prefix="robot/", frame=stage.worldbody.add_frame(pos=[0, 0, 0.35]))
-    for leg in ("LF", "RF", "LH", "RH"):
+    for leg, own, servos in zip(("LF", "RF", "LH", "RH"), friction, gain, strict=True):
+        for joint, share in zip(("abduction", "hip", "knee"), servos, strict=True):
+            servo = stage.actuator(f"robot/{leg}_{joint}")
+            servo.gainprm[0] *= share
+            servo.biasprm[1] *= share
         stage.add_pair(
             geomname1=f"robot/{leg}_foot",
             geomname2="board/board",
             condim=3,
-            friction=[friction, friction, 0.005, 0.0001, 0.0001],
+            friction=[own, own, 0.005, 0.0001, 0.0001],
             solref=[0.01, 1],
         )
-    for servo in stage.actuators:
-        if servo.name.startswith("robot/"):
-            servo.gainprm[0] *= gain
-            servo.biasprm[1] *= gain
     stage.option.timestep = 0.004
     return stage.compile()

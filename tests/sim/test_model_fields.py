@@ -68,21 +68,27 @@ THREE = DomainParams(
     imu_noise=np.zeros((3, 6)),
     payload=np.asarray((0.0, 4.0, 2.5)),
     payload_at=np.asarray(((0.01, 0.02, 0.03), (0.05, -0.04, 0.08), (0.0, 0.0, 0.1))),
-    friction=np.asarray((0.8, 0.4, 0.6)),
-    gain=np.asarray((1.0, 1.1, 0.8)),
+    friction=np.asarray(((0.8,) * 4, (0.4,) * 4, (0.6, 0.5, 0.4, 0.3))),
+    gain=np.asarray((np.ones((4, 3)), np.full((4, 3), 1.1), np.arange(1, 13).reshape(4, 3) / 10)),
     delay=np.zeros(3),
 )
-"""Nominal; loaded off the centre; loaded on the axis, weak and slippery."""
+"""Nominal; loaded off the centre; loaded on the axis, every foot and servo in its own way."""
 
 
 def test_friction_and_gain_reach_every_foot_and_leg_and_nothing_else(scene: Scene) -> None:
     model, fields = scene.model, randomized_fields(scene, THREE)
-    legs, board = scene.leg_ctrl.ravel(), scene.board_ctrl
-    for k, (friction, gain) in enumerate(((0.8, 400.0), (0.4, 440.0), (0.6, 320.0))):
-        rows = [(friction, friction, 0.005, 0.0001, 0.0001)] * 4
-        np.testing.assert_allclose(fields["pair_friction"][k], rows)
-        np.testing.assert_allclose(fields["actuator_gainprm"][k, legs, 0], gain)
-        np.testing.assert_allclose(fields["actuator_biasprm"][k, legs, 1], -gain)
+    board = scene.board_ctrl
+    for k, (friction, gain) in enumerate(zip(THREE.friction, THREE.gain, strict=True)):
+        for leg, own, servos in zip(scene.robot.legs, friction, gain, strict=True):
+            touching = model.pair(f"{leg.name}_contact")
+            geoms = (model.geom(int(x[0])).name for x in (touching.geom1, touching.geom2))
+            assert f"robot/{leg.foot}" in geoms
+            row = (own, own, 0.005, 0.0001, 0.0001)
+            np.testing.assert_allclose(fields["pair_friction"][k, touching.id], row)
+            for joint, share in zip(leg.joints, servos, strict=True):
+                servo = model.actuator(f"robot/{joint}").id
+                assert fields["actuator_gainprm"][k, servo, 0] == pytest.approx(400 * share)
+                assert fields["actuator_biasprm"][k, servo, 1] == pytest.approx(-400 * share)
         for name in ("actuator_gainprm", "actuator_biasprm"):
             ours, nominal = fields[name][k].copy(), getattr(model, name)
             np.testing.assert_array_equal(ours[board], nominal[board])

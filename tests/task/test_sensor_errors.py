@@ -65,9 +65,9 @@ def draws_of(robot: Robot) -> list[Draws]:
 
 def nominal() -> DomainParams:
     """With noise alone."""
-    zero, one = np.zeros(N), np.ones(N)
+    zero, friction, gain = np.zeros(N), np.full((N, 4), 0.8), np.ones((N, 4, 3))
     noise = np.tile((0.001, 0.002, 0.003, 0.01, 0.02, 0.03), (N, 1))
-    return DomainParams(noise, zero, np.zeros((N, 3)), 0.8 * one, one, zero)
+    return DomainParams(noise, zero, np.zeros((N, 3)), friction, gain, zero)
 
 
 def put(xp: types.ModuleType, tree: Any) -> Any:

@@ -89,7 +89,8 @@ def test_legs_in_another_order_have_the_same_partners(any_config: Config, robot:
 def loaded(side: float) -> DomainParams:
     """A load on the left or right shoulder, weak servos, delayed actions: (n,) = (2,)."""
     load, at = np.asarray((3.0, 0.0)), np.tile((0.04, 0.05 * side, 0.08), (2, 1))
-    friction, gain, delay = np.full(2, 0.7), np.asarray((0.9, 1.0)), np.asarray((0.0, 1.0))
+    friction, delay = np.full((2, 4), 0.7), np.asarray((0.0, 1.0))
+    gain = np.asarray((0.9, 1.0))[:, None, None] * np.ones((4, 3))
     return DomainParams(np.zeros((2, 6)), load, at, friction, gain, delay)
 
 

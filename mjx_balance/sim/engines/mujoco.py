@@ -25,7 +25,8 @@ class MujocoEngine:
         self.recorded: dict[str, np.ndarray] = {}  #: (n, sim_steps, ...) of the last decision
         self._size = count, threads or cores()
         self._batch = Batch(scene.model, *self._size)
-        self._params = np.full((count, 6), np.nan)
+        # Payload and its place, friction of every foot, gain of every servo.
+        self._params = np.full((count, 4 + 4 * len(scene.leg_ctrl)), np.nan)
         self.reset(np.arange(count))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -101,7 +102,7 @@ class MujocoEngine:
         self._params[ids] = _columns(params)
 
 
-def _columns(params: DomainParams) -> Float[np.ndarray, "n 6"]:
+def _columns(params: DomainParams) -> Float[np.ndarray, "n values"]:
     """Those that change the model."""
     count = len(params.payload)
     values = [np.reshape(getattr(params, name), (count, -1)) for name in MODEL_PARAMS]
