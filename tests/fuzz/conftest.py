@@ -9,10 +9,11 @@ import pytest
 
 
 @pytest.fixture
-def rounds() -> Iterator[random.Random]:
+def rounds(request: pytest.FixtureRequest) -> Iterator[random.Random]:
     """A generator for every round, until the time is over; a failure prints which one it was.
 
-    Round k depends on the seed and on k alone: `FUZZ_FIRST=k` begins with it.
+    Round k depends on the seed and on k alone: `FUZZ_FIRST=k` begins with it. `--junitxml` has
+    their number.
     """
     seed, first = os.environ.get("FUZZ_SEED", "0"), int(os.environ.get("FUZZ_FIRST", "0"))
     seconds = float(os.environ.get("FUZZ_SECONDS", "60"))
@@ -23,5 +24,6 @@ def rounds() -> Iterator[random.Random]:
             print(f"FUZZ_SEED={seed} FUZZ_FIRST={k}")  # pytest shows it after a failure
             yield random.Random(f"{seed} {k}")
             k += 1
+        request.node.user_properties.append(("rounds", k - first))
 
     return each()
