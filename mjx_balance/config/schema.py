@@ -192,6 +192,8 @@ class RandomizationConfig:
     """Greatest further delay, new in every decision, s."""
     dropout: Annotated[float, Ge(0), Lt(1)] = 0.0
     """Share of the IMU's samples that are lost; the last one comes again instead."""
+    ideal_share: Share = 0.0
+    """Share of the envs in which none of these is wrong, noise apart."""
     payload: NonNegative = 0.0
     """Greatest mass carried on the trunk, kg."""
     payload_offset: NonNegative = 0.05

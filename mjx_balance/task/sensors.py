@@ -50,7 +50,7 @@ class Draws(NamedTuple):
 
 def count_draws(robot: Robot) -> int:
     """Uniform random numbers that the errors of one env take."""
-    return sum(len(values) for values in _symmetric(RandomizationConfig(), robot).values()) + 2
+    return sum(len(values) for values in _symmetric(RandomizationConfig(), robot).values()) + 3
 
 
 def draw_errors(
@@ -58,16 +58,17 @@ def draw_errors(
 ) -> SensorErrors:
     """Turns `count_draws` random numbers in [0, 1) into errors."""
     xp, parts, done = uniform.__array_namespace__(), {}, 0
+    wrong = (uniform[..., -1:] >= ranges.ideal_share).astype(uniform.dtype)
 
     def every(*values: float) -> Array:
-        return np.asarray(values, uniform.dtype) + 0 * uniform[..., : len(values)]
+        return np.asarray(values, uniform.dtype) * wrong
 
     for name, most in _symmetric(ranges, robot).items():
         draws = uniform[..., done : done + len(most)]
-        parts[name], done = np.asarray(most, uniform.dtype) * (2 * draws - 1), done + len(most)
+        parts[name], done = every(*most) * (2 * draws - 1), done + len(most)
     for name in ("encoders", "readings"):
         parts[name] = xp.reshape(parts[name], (*parts[name].shape[:-1], len(robot.legs), 3))
-    delay = every(ranges.sensor_delay, ranges.command_delay) * uniform[..., done:]
+    delay = every(ranges.sensor_delay, ranges.command_delay) * uniform[..., done : done + 2]
     return SensorErrors(
         **parts,
         delay=delay,

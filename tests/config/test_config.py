@@ -156,7 +156,7 @@ BOUNDS: list[tuple[str, tuple[Any, ...], tuple[Any, ...]]] = [
     ("body_height board_rate payload_offset", (1.4,), (-0.3,)),
     ("body_height board_rate", (100.0,), (0.0,)),
     ("max_incline", (0.1, 10.0), (0.0, -1.0, 45.0)),
-    ("square_share gamma latency_share epsilon_start epsilon_end", (0.0, 1.0), SHARE),
+    ("square_share gamma latency_share ideal_share epsilon_start epsilon_end", (0.0, 1.0), SHARE),
     ("target_period", (4.0, 60.0), (0.0, -10.0, 3.99)),
     ("board_motions", (("sea",), ("ramps", "steps", "sea")), ((), ("sail",), ("sea", "sea"))),
     ("step_rate", (0.4, 100.0), (0.0, -1.0, 0.39)),
@@ -312,7 +312,7 @@ def test_what_is_no_config_is_refused(value: Any) -> None:
 def test_places_and_times_of_what_is_not_there_vary_nothing(field: dataclasses.Field[Any]) -> None:
     """Each alone, at 0.1: another robot's, scaled to its size, differ from ours in these."""
     alone = dataclasses.replace(RandomizationConfig(), **{field.name: 0.1})
-    idle = {"payload_offset", "payload_height", "push_min", "push_period"}
+    idle = {"payload_offset", "payload_height", "push_min", "push_period", "ideal_share"}
     assert alone.varies == (field.name not in idle)
 
 

@@ -79,8 +79,9 @@ def test_every_draw_lands_in_its_own_field(
     xp: types.ModuleType, robot: Robot, compiled: Any
 ) -> None:
     """Biases, scales, mounting, encoders: 0 is the least, 1/2 nothing, 1 the greatest; delays."""
-    assert count_draws(robot) == 41
+    assert count_draws(robot) == 42
     draws = np.asarray([np.full(41, 0.5), np.linspace(0, 1, 41), np.zeros(41)])
+    draws = np.column_stack((draws, np.zeros(3)))
     got = compiled(partial(draw_errors, RANGES, robot))(xp.asarray(draws, float))
     ramp = 2 * np.linspace(0, 1, 41) - 1
     np.testing.assert_allclose(got.bias[1, :3], 0.01 * ramp[:3], rtol=1e-5)
@@ -99,11 +100,23 @@ def test_every_draw_lands_in_its_own_field(
     assert {value.dtype for value in got} == {xp.asarray(draws, float).dtype}
 
 
+def test_a_share_of_the_envs_is_ideal(robot: Robot) -> None:
+    """The last draw says which: of share 0.25, those below it, where nothing is wrong at all."""
+    draws = np.random.default_rng(0).uniform(size=(3, 42))
+    draws[:, -1] = (0.0, 0.24, 0.25)
+    got = draw_errors(dataclasses.replace(RANGES, ideal_share=0.25), robot, draws)
+    every = draw_errors(RANGES, robot, draws)
+    for name, values in got._asdict().items():
+        assert not values[:2].any(), name
+        np.testing.assert_array_equal(values[2], getattr(every, name)[2])
+
+
 @pytest.mark.parametrize("name", [x.name for x in dataclasses.fields(RandomizationConfig)])
 def test_errors_are_drawn_if_any_is_asked_for(name: str) -> None:
     """And `varies` says whether parameters are."""
     sensors = {field for field in vars(RANGES) if getattr(RANGES, field) != 0}
     sensors -= {"friction_min", "friction_max", "push_period", "payload_offset", "payload_height"}
+    sensors -= {"event_grip", "event_strength"}
     ranges = RandomizationConfig(**{name: 0.01})
     assert ranges.sensors_err == (name in sensors)
     if name in sensors:
