@@ -74,7 +74,7 @@ def host(address: tuple[str, int], count: int, own: Member, patience_s: float) -
     where, until = f"{address[0]} port {address[1]}", time.monotonic() + patience_s
     connections: dict[int, socket.socket] = {}
     members, refusal = {0: own}, ""
-    callers: list[socket.socket] = []  # the oldest first
+    callers: dict[socket.socket, threading.Thread] = {}  # the oldest first
     hellos: queue.SimpleQueue[tuple[socket.socket, Hello]] = queue.SimpleQueue()
     try:
         server = listen(address)
@@ -86,19 +86,25 @@ def host(address: tuple[str, int], count: int, own: Member, patience_s: float) -
         while len(members) < count and not refusal:
             with contextlib.suppress(OSError):
                 caller = server.accept()[0]
-                threading.Thread(target=_ask, args=(caller, hellos), daemon=True).start()
-                callers = [*(x for x in callers if x.fileno() >= 0), caller]
+                asks = threading.Thread(target=_ask, args=(caller, hellos), daemon=True)
+                asks.start()
+                callers = {x: y for x, y in callers.items() if x.fileno() >= 0} | {caller: asks}
                 if len(callers) > CALLERS:
-                    _shut_down(callers.pop(0))
+                    oldest = next(iter(callers))
+                    del callers[oldest]
+                    _shut_down(oldest)
             for index in [k for k, x in connections.items() if _has_left(x)]:
                 connections.pop(index).close()
                 del members[index]
             if time.monotonic() > until:
                 missing = ", ".join(str(k) for k in range(count) if k not in members)
                 refusal = f"process {missing} has not come to {where} in {patience_s:g} s"
-            with contextlib.suppress(queue.Empty, ValueError):
+            with contextlib.suppress(queue.Empty):
                 caller, hello = hellos.get_nowait()
-                callers.remove(caller)  # ValueError: it is not there, and has been shut down
+                if caller not in callers:  # it has been shut down
+                    caller.close()
+                    continue
+                del callers[caller]
                 index, others = hello.index, hello.count
                 if others != count or index not in range(1, count) or index in members:
                     refusal = (
@@ -109,6 +115,10 @@ def host(address: tuple[str, int], count: int, own: Member, patience_s: float) -
                 connections[index], members[index] = caller, hello.member
     for caller in callers:
         _shut_down(caller)
+    for asks in callers.values():
+        asks.join()
+    while not hellos.empty():
+        hellos.get()[0].close()
     if refusal:
         _send(connections.values(), {"refusal": refusal})
         for connection in connections.values():

@@ -293,6 +293,13 @@ def test_whoever_comes_after_the_meeting_is_told(address: Address, come: Any) ->
     assert message(outcome) == f"process 0 has left the meeting at 127.0.0.1 port {address[1]}"
 
 
+def test_one_of_several_with_the_same_number_is_let_in(address: Address, come: Any) -> None:
+    """The others are told, and their connections are closed: pytest counts open ones as errors."""
+    _, *outcomes = at_once(lambda: come(0, 2), *[lambda: come(1, 2, 3)] * 6)
+    refused = [message(x) for x in outcomes if isinstance(x, Exception)]
+    assert len(refused) == 5
+
+
 @pytest.mark.parametrize("banner", [b"", b"SSH-2.0-x\r\n", b'{"mjx_balance": 5}\n', b"[" * 10**5])
 def test_another_service_at_the_address_is_not_joined(
     banner: bytes, address: Address, opened: Any, come: Any
