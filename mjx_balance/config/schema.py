@@ -279,6 +279,9 @@ class DQNConfig:
     head: Literal["joint", "factored", "radial"] = "joint"
     """How the network computes action values (dqn/networks.py): one output per action; the sum
     of one output per level and axis; or a best action and a radial profile around it."""
+    zero_at_rest: bool = False
+    """Whether the radial head's best action for an observation of zeros is no height change: a
+    level robot at rest, wherever its legs are, needs none (chosen: no)."""
     whiten_steps: CountFrom0 = 0
     """Env steps over which the covariance of the inputs is estimated, for whitening; 0: no
     whitening (paper)."""

@@ -114,6 +114,11 @@ def _check_learning(config: Config) -> None:
             f"action is 'continuous', but head is {quote(dqn.head)}, which has values of the "
             "grid's actions only; action must be 'grid', or head 'radial'"
         )
+    if dqn.zero_at_rest and dqn.head != "radial":
+        raise ConfigError(
+            f"zero_at_rest is True, but head is {quote(dqn.head)}, which has no best point to hold "
+            "at 0; head must be 'radial'"
+        )
     if dqn.min_replay_size > dqn.replay_capacity:
         raise ConfigError(
             f"min_replay_size is {dqn.min_replay_size}; it must not exceed replay_capacity, "

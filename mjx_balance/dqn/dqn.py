@@ -389,10 +389,13 @@ class DQN:
         return head.off_grid() if self.spec.continuous else head
 
     def fold(self, params: Params, statistics: RunningStatistics) -> Params:
-        """Folds the whitening into the parameters, which is cheaper than whitening every input."""
-        if not self.spec.config.whiten_steps:
-            return params
-        return self.network.fold_whitening(params, statistics.mean, statistics.matrix)
+        """Folds the whitening into the parameters, which is cheaper than whitening every input.
+
+        With `zero_at_rest`, the head's best point for an observation of zeros then becomes 0.
+        """
+        if self.spec.config.whiten_steps:
+            params = self.network.fold_whitening(params, statistics.mean, statistics.matrix)
+        return self.network.fold_rest(params) if self.spec.config.zero_at_rest else params
 
 
 def td_error(

@@ -47,6 +47,15 @@ class QNetwork(nn.Module):
         stretch = self.param("stretch", nn.initializers.zeros, (len(factors),))
         return heads.Radial(out, profile, stretch, factors)
 
+    def fold_rest(self, params: Any) -> Any:
+        """Returns parameters of a radial network whose mu is 0 for an observation of zeros."""
+        layers = dict(params["params"])
+        obs_size = layers["hidden_0"]["kernel"].shape[0]
+        rest: Any = self.apply(params, jnp.zeros(obs_size), method="head")
+        kernel, bias = layers["head"]["kernel"], layers["head"]["bias"]
+        layers["head"] = {"kernel": kernel, "bias": bias.at[1:].add(-rest.out[1:])}
+        return {"params": layers}
+
     def fold_whitening(self, params: Any, mean: jax.Array, matrix: jax.Array) -> Any:
         """Returns parameters for obs that equal `params` for (obs - mean) @ matrix.
 

@@ -1,11 +1,15 @@
 """Running statistics, the whitening matrix, and its place in the network."""
 
+import dataclasses
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fixtures import probes
 
-from mjx_balance.dqn import QNetwork, normalization
+from mjx_balance.dqn import DQN, QNetwork, normalization
 from mjx_balance.dqn.mesh import AXIS
 
 FLOOR = 1e-6
@@ -90,3 +94,28 @@ def test_folded_parameters_take_raw_observations(radial: bool, hidden: tuple[int
     folded = network.fold_whitening(params, mean, matrix)
     got = np.asarray(jax.jit(network.apply)(folded, obs))
     np.testing.assert_allclose(got, expected, rtol=2e-4, atol=2e-4)
+
+
+def test_an_observation_of_zeros_has_its_best_action_at_0(make_dqn: Callable[..., DQN]) -> None:
+    """A raw one; the best point of any other moves by as much, and its value stays."""
+    rng = np.random.default_rng(0)
+
+    def normal(*shape: int) -> jax.Array:
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    network = QNetwork((16, 8), (3, 4), radial=True)
+    shapes = jax.eval_shape(network.init, jax.random.PRNGKey(0), jnp.zeros(5))
+    params = jax.tree.map(lambda x: normal(*x.shape), shapes)
+    statistics = normalization.init(5, FLOOR)._replace(mean=normal(5), matrix=normal(5, 5))
+    obs = jnp.concatenate((jnp.zeros((1, 5)), normal(20, 5)))
+
+    def head(zero: bool) -> np.ndarray:
+        dqn = make_dqn(probes.NoisyState(), head="radial", whiten_steps=8, zero_at_rest=zero)
+        dqn = dataclasses.replace(dqn, network=network)
+        return np.asarray(dqn.head(dqn.fold(params, statistics), obs).out)
+
+    free, held = head(False), head(True)
+    assert np.abs(free[0, 1:]).min() > 0.1
+    np.testing.assert_allclose(held[0, 1:], 0, atol=1e-5)
+    np.testing.assert_allclose(held[:, 0], free[:, 0])
+    np.testing.assert_allclose(held[:, 1:], free[:, 1:] - free[0, 1:], rtol=1e-4, atol=1e-4)
