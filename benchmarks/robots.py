@@ -25,7 +25,7 @@ from mjx_balance.evaluation.rollout import observing, policy_scene
 from mjx_balance.policy.file import load_policy
 from mjx_balance.robots.catalogue import makers
 
-SUITES = {"paper": 1, "corner": 1, "push": 4}
+SUITES = {"paper": 1, "corner": 1, "sea": 1, "push": 4}
 """Suite -> what `--scenarios` is divided by."""
 PEERS = ("pd-imu", "rate-oracle")
 TIMES = "times.json"  # beside the policies: seconds that each robot's `train.py` took
@@ -37,6 +37,7 @@ def trained(robot: str, args: argparse.Namespace) -> Path:
     if not path.is_file():
         with tempfile.TemporaryDirectory() as work:
             flags = f"--robot {robot} --preset {args.preset} --engine mujoco --eval-scenarios 1"
+            flags += f" --num-env-steps {args.decisions}"
             command = [sys.executable, "train.py", *flags.split(), "--run-dir", f"{work}/run"]
             began = time.monotonic()
             subprocess.run(command, cwd=REPO, check=True)
@@ -74,16 +75,18 @@ def main() -> None:
     parser = common.arguments(__doc__)
     parser.add_argument("--robots", nargs="+", default=makers())
     parser.add_argument("--policies", type=Path, default=REPO / "policies" / "robots")
-    parser.add_argument("--preset", default="best")
+    parser.add_argument("--preset", default="real")
+    parser.add_argument("--decisions", type=int, default=120_000)
     parser.add_argument("--scenarios", type=int, default=256, help="a quarter of it in push")
     args = parser.parse_args()
     policies = {robot: trained(robot, args) for robot in args.robots}
     rows = [robot_row(robot, path, args.scenarios) for robot, path in policies.items()]
     counts = ", ".join(str(args.scenarios // divisor) for divisor in SUITES.values())
     note = (
-        f"Preset `{args.preset}`, engine `mujoco`, one seed; {common.machine()}. Mean tilt in deg "
-        f"over {counts} held-out scenarios of {common.DURATION:g} s in {', '.join(SUITES)}; falls "
-        "in brackets, none elsewhere; last, the policy's mean over that of `rate-oracle`."
+        f"Preset `{args.preset}` with {args.decisions:,} decisions, engine `mujoco`, one seed; "
+        f"{common.machine()}. Mean tilt in deg over {counts} held-out scenarios of "
+        f"{common.DURATION:g} s in {', '.join(SUITES)}; falls in brackets, none elsewhere; last, "
+        "the policy's mean over that of `rate-oracle`."
     )
     common.report(args, "robots", rows, note)
 

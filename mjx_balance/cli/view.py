@@ -22,7 +22,7 @@ from mjx_balance.task.pushes import Pushes
 STEP = 1.0
 """Change of the board's target by one key press, deg."""
 PUSH_SPEED = 0.4
-"""Speed that a push gives our own robot, m/s; scaled by `size_scale` for others."""
+"""Speed that a push gives our own robot, m/s; scaled by `push_scale` for others."""
 RIGHT, LEFT, DOWN, UP, PUSH_KEY, LEVEL = 262, 263, 264, 265, 257, 268
 """GLFW codes of the arrow keys, Enter and Home."""
 KEYS = "arrows: tilt the board\nHome: level\nEnter: push"
@@ -104,7 +104,7 @@ class Session:
             self.target = np.zeros(2)
         elif key == PUSH_KEY:
             angle = self.rng.uniform(0, 2 * math.pi)
-            speed = PUSH_SPEED * self.scene.robot.size_scale
+            speed = PUSH_SPEED * self.scene.robot.push_scale
             self.push = speed * np.asarray((math.cos(angle), math.sin(angle)))
 
     def step(self) -> np.ndarray:

@@ -12,8 +12,8 @@ def for_robot(config: Config, robot: str) -> Config:
     """Adapts a config of our own robot to another robot.
 
     Standing height and greatest height change become the robot's (`robots.measure`). Payloads scale
-    with its mass; pushes, offsets and the scale of foot heights with its size. Angles, board rate
-    and fall limit stay.
+    with its mass; offsets and the scale of foot heights with its size; pushes with the speed from
+    which it tips over. Angles, board rate and fall limit stay.
 
     Raises:
       ConfigError: if there is no such robot.
@@ -30,11 +30,12 @@ def for_robot(config: Config, robot: str) -> Config:
 
 
 def scale_ranges(ranges: RandomizationConfig, robot: Robot) -> RandomizationConfig:
-    """Scales payloads with the robot's mass, their offsets and push speeds with its size."""
-    lengths = ("payload_offset", "payload_height", "push_min", "push_max")
-    sizes = {name: getattr(ranges, name) * robot.size_scale for name in lengths}
-    masses = {n: getattr(ranges, n) * robot.mass_scale for n in ("payload", "event_payload")}
-    return dataclasses.replace(ranges, **masses, **sizes)
+    """Scales payloads with the robot's mass, their offsets with its size, pushes as it tips."""
+    scales = dict.fromkeys(("payload", "event_payload"), robot.mass_scale)
+    scales |= dict.fromkeys(("payload_offset", "payload_height"), robot.size_scale)
+    scales |= dict.fromkeys(("push_min", "push_max"), robot.push_scale)
+    scaled = {name: getattr(ranges, name) * scale for name, scale in scales.items()}
+    return dataclasses.replace(ranges, **scaled)
 
 
 def greatest_incline(task: TaskConfig, robot: Robot) -> float:

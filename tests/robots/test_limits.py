@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from mjx_balance.config import Config, ConfigError, TaskConfig, preset
+from mjx_balance.config import Config, ConfigError, RandomizationConfig, TaskConfig, preset
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import check_robot, for_robot, greatest_incline
 from mjx_balance.sim.scene import load_scene
@@ -120,16 +120,22 @@ def test_delays_longer_than_a_decision_are_refused(
 
 
 def test_another_robots_config_is_scaled_by_its_mass_and_size() -> None:
-    """Of 83.5 kg and 0.3285 m, against 15.2 kg and 0.193 m: 5.493 and 1.702."""
+    """Of 83.5 kg and 0.3285 m, against 15.2 kg and 0.193 m: 5.493 and 1.702.
+
+    It stands 0.571 m high on feet 0.1916 m aside, ours 0.35 m high and 0.142 m aside: it bears
+    pushes of 0.1916 / 0.142 * sqrt(0.35 / 0.571) = 1.057 of ours.
+    """
     best = preset("best")
     assert for_robot(best, "quadruped") == best
     big = for_robot(best, "b2")
     assert (big.robot, big.task.body_height, big.task.action_max) == ("b2", 0.571, 0.00511)
     assert big.task.height_scale == pytest.approx(0.01702)
     assert big.randomization.payload == pytest.approx(5 * 5.493)
+    laid = dataclasses.replace(best, randomization=RandomizationConfig(event_payload=2.0))
+    assert for_robot(laid, "b2").randomization.event_payload == pytest.approx(2 * 5.493)
     assert big.randomization.payload_offset == pytest.approx(0.05 * 1.702)
     assert big.randomization.payload_height == pytest.approx(0.08 * 1.702)
-    assert big.randomization.push_max == pytest.approx(0.4 * 1.702)
+    assert big.randomization.push_max == pytest.approx(0.4 * 1.057)
     assert (big.task.fail_tilt, big.task.board_rate) == (6.0, 3.5)
     assert not for_robot(preset("default"), "b2").randomization.varies
 
