@@ -46,6 +46,7 @@ SMALLEST = {
     "robots.py --robots go1 --scenarios 4": "| go1 | 12.7 kg |",
     "results.py policies/best.safetensors --scenarios 3 --others 2 --rest 1 --suites paper "
     "--out {work}.json": "| paper | 0 of 3 |",
+    "suites.py best --suites bias --scenarios 1": "| bias |",
     "replay.py --rounds 1": "| 136 | 1024 | full |",
     "runtime.py --calls 1000": "| ordinary |",
     "soak.py --minutes 0.2 --samples 20000": "| `Controller`, 20,000 samples |",

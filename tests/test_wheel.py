@@ -38,6 +38,7 @@ def test_what_is_in_it(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     expected = {"py.typed", "runtime.py", "policies/best.safetensors", "report/page.html"}
+    expected |= {"policies/real.safetensors"}
     expected |= {f"scenes/{name}.xml" for name in ("board", "quadruped", "scene")}
     expected |= {f"robots/{name}.toml" for name in shipped()}
     expected |= {f"policies/robots/{name}.safetensors" for name in makers()}

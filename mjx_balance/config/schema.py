@@ -280,8 +280,8 @@ class DQNConfig:
     """How the network computes action values (dqn/networks.py): one output per action; the sum
     of one output per level and axis; or a best action and a radial profile around it."""
     zero_at_rest: bool = False
-    """Whether the radial head's best action for an observation of zeros is no height change: a
-    level robot at rest, wherever its legs are, needs none (chosen: no)."""
+    """Whether the radial head's best action for an observation of zeros, of a level robot at rest
+    in its stance, is no height change (chosen: no)."""
     whiten_steps: CountFrom0 = 0
     """Env steps over which the covariance of the inputs is estimated, for whitening; 0: no
     whitening (paper)."""

@@ -113,7 +113,13 @@ def test_preset_paper_has_the_papers_numbers() -> None:
 
 @pytest.mark.parametrize(
     ("name", "digest"),
-    [("default", "4d84e143"), ("best", "ccea5988"), ("quick", "316a1d84"), ("smoke", "51dacd1d")],
+    [
+        ("default", "4d84e143"),
+        ("best", "ccea5988"),
+        ("quick", "316a1d84"),
+        ("smoke", "51dacd1d"),
+        ("real", "91172c57"),
+    ],
 )
 def test_presets_are_those_that_results_were_measured_with(name: str, digest: str) -> None:
     """Digests of what differs from the paper: who means to change it, changes it here."""
@@ -125,7 +131,7 @@ def test_presets_are_those_that_results_were_measured_with(name: str, digest: st
 
 @pytest.mark.parametrize(
     ("name", "samples"),
-    [("paper", 32), ("default", 32), ("best", 64), ("quick", 128), ("smoke", 32)],
+    [("paper", 32), ("default", 32), ("best", 64), ("quick", 128), ("smoke", 32), ("real", 64)],
 )
 @pytest.mark.parametrize("num_envs", [None, 64, 512, 2_048])
 def test_the_replay_ratio_does_not_depend_on_the_number_of_envs(
@@ -265,10 +271,11 @@ def test_every_number_has_its_bounds_tested() -> None:
             {"action": "continuous", "head": "joint"},
             "action is 'continuous', but head is 'joint', .*; action must be 'grid', or head 'rad",
         ),
+        ({"zero_at_rest": True}, "zero_at_rest is True, but head is 'joint', .*; head must be"),
         ({"head": "round"}, "head is 'round'; it must be one of joint, factored, radial"),
         ({"export": "first"}, "export is 'first'; it must be one of last, best"),
         ({"export": "best", "eval_every": 0}, "export is 'best', but eval_every is 0"),
-        ({"preset": "papr"}, "'papr'; known presets: paper, default, best, quick, smoke"),
+        ({"preset": "papr"}, "'papr'; known presets: paper, default, best, real, quick, smoke"),
         (
             {"friction_min": 0.9, "friction_max": 0.8},
             "friction_max is 0.8; it must not be less than friction_min, 0.9",

@@ -185,10 +185,10 @@ def test_a_makers_robot_can_follow_the_board(name: str) -> None:
     """
     scene = shipped_scene(name)
     per_second = 5 * scene.task.action_max * np.abs(measure_response(scene).gain)
-    assert 4.45 * 0.92 < per_second.min() < 4.45 * 1.2
+    assert per_second.min() > 4.45 * 0.92
     rollout = run_suite(scene, make_controller("rate-oracle", scene), "corner", 4, 12.0, 0)
     assert not rollout.fell.any()
-    assert rollout.tilt.mean() < 0.2
+    assert rollout.tilt.mean() < 0.4
 
 
 @pytest.mark.parametrize("name", bodies.MAKERS)
