@@ -32,6 +32,7 @@ SETTLE_ROUNDS = 4
 TRIM_ERROR = 1e-3  #: greatest distance of a joint from its target, rad
 NUDGE = 0.05  #: along both axes, m/s; a robot on too soft servos does not come to rest after it
 NUDGE_STEPS = 7_500
+WARNING_STEPS = 50  #: from one look for a warning of MuJoCo to the next
 LEAST_STEP = 1.05  #: precision of the least stiffness in an error, as a factor
 
 
@@ -293,7 +294,7 @@ def _settle(layout: Layout) -> Stance:
     if not (_is_still(layout, data) and _is_at_targets(layout, data)):
         data, trim = _rest(layout, np.maximum(_too_soft_by(layout), 1))
         if not _endures(layout, data):
-            raise ConfigError(_why_unsettled(layout, data))
+            raise ConfigError(_why_unsettled(layout))
     state = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
     return Stance(*state, trim, data.sensordata[layout.imu].copy())
 
@@ -318,13 +319,20 @@ def _rest(
     stiff.dof_armature[_leg_dofs(model, servos)] *= stiffer  # or they would be too fast for a step
     for _ in range(SETTLE_ROUNDS):
         data.ctrl[servos] = angles + trim
-        mujoco.mj_step(stiff, data, nstep=SETTLE_STEPS)
+        _step(stiff, data, SETTLE_STEPS)
         trim = trim + angles - data.qpos[legs]
     trim = trim * stiffer
     data.ctrl[servos] = angles + trim
     data.qpos[root : root + 2] = 0
-    mujoco.mj_step(model, data, nstep=SETTLE_STEPS)
+    _step(model, data, SETTLE_STEPS)
     return data, trim
+
+
+def _step(model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> None:
+    """Steps until MuJoCo warns: steps after a divergence tell nothing, and are slow."""
+    for _ in range(0, steps, WARNING_STEPS):
+        if not data.warning.number.any():
+            mujoco.mj_step(model, data, nstep=min(steps, WARNING_STEPS))
 
 
 def _standing_angles(layout: Layout) -> Float[np.ndarray, "legs 3"]:
@@ -375,14 +383,18 @@ def _endures(layout: Layout, data: mujoco.MjData) -> bool:
     """Whether the robot is still, and comes to rest again after a nudge."""
     nudged = copy.copy(data)
     nudged.qvel[layout.trunk_velocity] += NUDGE
-    mujoco.mj_step(layout.model, nudged, nstep=NUDGE_STEPS)
-    return _is_still(layout, data) and _is_still(layout, nudged)
+    if _is_still(layout, data):
+        _step(layout.model, nudged, NUDGE_STEPS)
+    return _is_still(layout, nudged)
 
 
-def _why_unsettled(layout: Layout, data: mujoco.MjData) -> str:
+def _why_unsettled(layout: Layout) -> str:
     """Says that the robot does not stand, and why, as far as one can tell."""
     robot, height = layout.robot, layout.task.body_height
     limits = layout.model.actuator_forcerange[layout.leg_ctrl, 1]
+    # Servos that are far too stiff reach their limits in any case: the rules' servos tell.
+    model = _with_gains(layout, _too_soft_by(layout))
+    data, _ = _rest(dataclasses.replace(layout, model=model), np.ones(limits.shape))
     share = np.abs(data.actuator_force[layout.leg_ctrl]) / limits
     if share.max() > 0.99:
         leg, joint = np.unravel_index(np.argmax(share), share.shape)

@@ -402,14 +402,14 @@ def test_training_starts_tilted_as_evaluation_does(config: Config) -> None:
     """The same start in MJX's env and in plain MuJoCo: observation, tilt before, first decision."""
     config = dataclasses.replace(with_task(config, start_incline=5.0), engine="mujoco")
     env = BalanceEnv(config)
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 4))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
     scenario = jax.tree.map(np.asarray, state.pipeline_state.scenario)
     batch = BatchEnv(load_scene(config), Episodes(scenario, rngs=[np.random.default_rng(0)] * 4))
     np.testing.assert_allclose(np.asarray(state.obs), batch.initial_obs, atol=2e-4)
     before = batch.state.memory.tilt
     np.testing.assert_allclose(before, np.hypot(*scenario.start.T), atol=0.02)  # of the stance
     np.testing.assert_allclose(state.pipeline_state.memory.tilt, before, rtol=1e-4)
-    after = jax.vmap(env.step)(state, jnp.full(4, 220))
+    after = jax.jit(jax.vmap(env.step))(state, jnp.full(4, 220))
     outcome = batch.step(np.zeros((4, 2)))
     np.testing.assert_allclose(after.metrics["tilt_deg"], outcome.tilt.mean(axis=1), rtol=1e-3)
     np.testing.assert_allclose(after.reward, outcome.reward, atol=1e-3)

@@ -789,7 +789,7 @@ STRONG = {"knee_torque": "500", "hip_torque": "500"}
         ),
         (
             [],
-            STRONG | {"servo_stiffness": "1e6"},
+            {"servo_stiffness": "1e6"},
             r"with servo_stiffness 1e\+06 N m/rad: leave out servo_stiffness of its file",
         ),
         (
