@@ -44,6 +44,7 @@ def assert_learnt(dqn: DQN, state: Any) -> None:
         np.testing.assert_allclose(np.asarray(q_values), (-x, x), atol=0.15)
 
 
+@pytest.mark.slow
 def test_training_ends_in_good_values(make: Callable[..., DQN]) -> None:
     faults = {"obs": math.nan, "reward": math.inf, "done": math.nan, "reset": -math.inf}
     dqn = make(probes.Faulty(faults, 0.03))

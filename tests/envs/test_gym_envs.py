@@ -109,7 +109,7 @@ def short(config: Config, decisions: int, **task: Any) -> Config:
     return dataclasses.replace(config, task=dataclasses.replace(config.task, **task))
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("kind", ["discrete", pytest.param("continuous", marks=pytest.mark.slow)])
 def test_gymnasium_finds_nothing_to_warn_of(kind: str, screen: list[Screen]) -> None:
     """Warnings are errors here; every render mode is tried."""
     env = gymnasium.make(ENV, action=kind)

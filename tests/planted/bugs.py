@@ -10,6 +10,7 @@ is found if its expression occurs only once in the package.
 
 import argparse
 import ast
+import functools
 import os
 import string
 import sys
@@ -81,13 +82,14 @@ def matches(shape: ast.AST, tree: ast.AST) -> Iterator[tuple[ast.AST, Captured]]
             yield node, captured
 
 
-def functions(tree: ast.AST, prefix: str) -> Iterator[tuple[str, ast.AST]]:
+@functools.cache
+def functions(tree: ast.AST, prefix: str) -> list[tuple[str, ast.AST]]:
     """Dotted names and nodes of functions, classes and whatever they hold."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-            name = f"{prefix}.{node.name}"
-            yield name, node
-            yield from functions(node, name)
+    nodes = [
+        x for x in ast.iter_child_nodes(tree) if isinstance(x, (ast.FunctionDef, ast.ClassDef))
+    ]
+    named = [(f"{prefix}.{node.name}", node) for node in nodes]
+    return [x for name, node in named for x in [(name, node), *functions(node, name)]]
 
 
 def find(bug: Bug, trees: dict[str, ast.Module]) -> Place | None:
