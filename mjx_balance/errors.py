@@ -1,12 +1,57 @@
-"""Exit codes of the commands, and the base class of errors in the user's input."""
+"""Exit codes of the commands, errors in the user's input, and text from outside made safe to show.
 
+Safe text is one short line without control characters. `runtime.py`, one file for a robot, has a
+copy of `shorten`.
+"""
+
+import os
+import shlex
+import subprocess
+from pathlib import Path
 from typing import ClassVar
-
-from mjx_balance.text import MESSAGE, shorten
 
 FAILED = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
+
+MESSAGE = 300  #: greatest length of an error message, characters
+PATH = 4096  #: of a path that a command prints for the user to copy
+
+
+def printable(text: str) -> str:
+    """Returns text with "?" for control characters, which a terminal would obey, and the like."""
+    return "".join(x if x.isprintable() else "?" for x in text)
+
+
+def shorten(text: object, limit: int = 80, tail: int = 0) -> str:
+    """Returns text in one line of at most `limit` characters, without control characters.
+
+    Args:
+      text: any object; its `str` counts.
+      limit: greatest length; "..." replaces the middle of longer text.
+      tail: number of characters at the end to keep then.
+    """
+    whole = str(text)
+    if len(whole) > 8 * limit:
+        whole = f"{whole[: 4 * limit]} ... {whole[-4 * limit :]}"
+    line = printable(" ".join(whole.split()))
+    if len(line) <= limit:
+        return line
+    return f"{line[: limit - tail - 3]}...{line[len(line) - tail :]}"
+
+
+def quote(value: object) -> str:
+    """Returns a value's `repr`, shortened."""
+    try:
+        return shorten(repr(value))
+    except ValueError:  # an int with too many digits
+        return "a number of thousands of digits"
+
+
+def shell(path: Path) -> str:
+    """Returns a path as a command's argument, quoted where the user's shell needs it."""
+    name = printable(str(path))
+    return subprocess.list2cmdline([name]) if os.name == "nt" else shlex.quote(name)
 
 
 def how_to_install(extra: str) -> str:

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from mjx_balance import runtime
 from mjx_balance.config import Config, to_dict
+from mjx_balance.errors import shorten
 from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
 from mjx_balance.evaluation.suites import draw_suite
 from mjx_balance.policy.file import load_policy, save_policy
@@ -29,7 +30,6 @@ from mjx_balance.runtime import ACCEL_MOST, GYRO_MOST, Controller, State
 from mjx_balance.task import step, tilt
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
-from mjx_balance.text import shorten
 
 REPO = Path(__file__).parent.parent
 BEST = REPO / "policies/best.safetensors"

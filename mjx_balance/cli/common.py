@@ -8,13 +8,12 @@ from typing import Annotated, Literal
 import tyro
 
 from mjx_balance.config import check, preset
-from mjx_balance.errors import USAGE_ERROR, InputError
+from mjx_balance.errors import PATH, USAGE_ERROR, InputError, shorten
 from mjx_balance.evaluation import rollout
 from mjx_balance.evaluation.controllers import Controller, ControllerError, make_controller
 from mjx_balance.policy.file import load_policy
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import Scene, load_scene
-from mjx_balance.text import PATH, shorten
 
 HELP = ("-h", "--help")
 

@@ -7,14 +7,13 @@ import tyro
 from rich.console import Console
 
 from mjx_balance.cli.common import ControllerArgs, check_out, complain
-from mjx_balance.errors import FAILED
+from mjx_balance.errors import FAILED, PATH, shorten
 from mjx_balance.evaluation.controllers import Controller
 from mjx_balance.evaluation.rollout import run_suite, suite_scene, summarize
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.report.progress import Display
 from mjx_balance.report.tables import evaluation_table, print_table
 from mjx_balance.sim.scene import Scene
-from mjx_balance.text import PATH, shorten
 
 
 @dataclasses.dataclass(frozen=True)

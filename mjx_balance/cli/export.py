@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 import tyro
 
 from mjx_balance.cli.common import complain
-from mjx_balance.errors import how_to_install
+from mjx_balance.errors import PATH, how_to_install, shorten
 from mjx_balance.policy.file import convert_policy, find_policy, load_policy
 from mjx_balance.policy.manifest import FORMAT_VERSION
-from mjx_balance.text import PATH, shorten
 
 
 @dataclasses.dataclass(frozen=True)

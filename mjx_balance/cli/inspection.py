@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from mjx_balance.config import check, preset
+from mjx_balance.errors import MESSAGE, quote, shorten
 from mjx_balance.evaluation.suites import SUITES
 from mjx_balance.robots.catalogue import robot_notes
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline, scale_ranges
@@ -17,7 +18,6 @@ from mjx_balance.robots.robot import Leg, gain_text
 from mjx_balance.sim.scene import ROBOT, Scene, load_scene
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
-from mjx_balance.text import MESSAGE, quote, shorten
 
 MAX_CREEP = 0.01
 """Greatest speed of a robot that counts as standing still, m/s."""

@@ -8,8 +8,8 @@ import tyro
 from rich.console import Console
 
 from mjx_balance.cli.common import check_out, complain
+from mjx_balance.errors import PATH, shorten
 from mjx_balance.report.progress import Display
-from mjx_balance.text import PATH, shorten
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,9 +7,8 @@ import tyro
 from tyro.conf import Positional
 
 from mjx_balance.cli.common import check_out, complain
-from mjx_balance.errors import FAILED
+from mjx_balance.errors import FAILED, PATH, shell, shorten
 from mjx_balance.files.run_folder import write_atomically
-from mjx_balance.text import PATH, shell, shorten
 
 
 def robot(argv: list[str]) -> int:

@@ -9,12 +9,11 @@ from rich.console import Console
 
 from mjx_balance.cli.common import HELP, complain
 from mjx_balance.config import Config, preset, read_run_config
-from mjx_balance.errors import FAILED, INTERRUPTED, how_to_install
+from mjx_balance.errors import FAILED, INTERRUPTED, MESSAGE, how_to_install, shorten
 from mjx_balance.policy.file import PolicyError
 from mjx_balance.quiet import quiet_imports
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.engines.table import unused_modules
-from mjx_balance.text import MESSAGE, shorten
 
 
 @dataclasses.dataclass(frozen=True)

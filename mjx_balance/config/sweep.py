@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from mjx_balance.config.schema import Config, ConfigError, DQNConfig
-from mjx_balance.text import quote
+from mjx_balance.errors import quote
 
 SWEEPABLE = (
     *("learning_rate", "learning_rate_end_share", "gamma", "huber_delta", "max_grad_norm"),

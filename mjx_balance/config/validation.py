@@ -4,8 +4,8 @@ from mjx_balance.config.presets import preset
 from mjx_balance.config.schema import Config, ConfigError, RandomizationConfig, TaskConfig
 from mjx_balance.config.sea import check_platform, significant_angle
 from mjx_balance.config.sweep import sweep_grid, with_values
+from mjx_balance.errors import quote
 from mjx_balance.files.validation import check_types
-from mjx_balance.text import quote
 
 MOST_STEPS = 10_000  #: greatest number of physics steps per decision
 MOST_READ = 1_000_000  #: greatest number of IMU samples that an observation averages

@@ -16,13 +16,13 @@ from gymnasium.vector.utils import batch_space
 from mjx_balance.config import Config, ConfigError, check
 from mjx_balance.config import preset as find_preset
 from mjx_balance.envs.batch import BatchEnv, draw_episodes
+from mjx_balance.errors import quote
 from mjx_balance.render.drawing import Painter, RenderError, Window
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.observation import input_rows
 from mjx_balance.task.step import DIVERGED
-from mjx_balance.text import quote
 
 NO_EPISODE = "no episode is under way; call reset() before step()"
 

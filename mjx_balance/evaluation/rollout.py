@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_balance.config import Config, TaskConfig
 from mjx_balance.envs.batch import BatchEnv, Episodes, rows
-from mjx_balance.errors import InputError
+from mjx_balance.errors import InputError, quote
 from mjx_balance.evaluation.controllers import Controller, View
 from mjx_balance.evaluation.suites import SUITES, draw_suite
 from mjx_balance.machine import available_memory
@@ -24,7 +24,6 @@ from mjx_balance.sim.scene import Scene, load_scene, soften
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.reward import failed
 from mjx_balance.task.step import Outcome
-from mjx_balance.text import quote
 
 TILT_COPIES = 3  #: arrays of all tilts, float64, that a summary needs at once
 SETTLED_SECONDS = 3.0  #: end of every target's period in which the board has long been at rest, s

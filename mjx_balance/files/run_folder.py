@@ -12,8 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mjx_balance.errors import InputError
-from mjx_balance.text import PATH, shell, shorten
+from mjx_balance.errors import PATH, InputError, shell, shorten
 
 if sys.platform == "win32":
     import msvcrt

@@ -13,8 +13,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from mjx_balance.errors import InputError
-from mjx_balance.text import MESSAGE, quote, shorten
+from mjx_balance.errors import MESSAGE, InputError, quote, shorten
 
 T = TypeVar("T")
 

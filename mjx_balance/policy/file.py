@@ -10,11 +10,11 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from mjx_balance.errors import quote
 from mjx_balance.files.run_folder import RunFolder, write_atomically
 from mjx_balance.policy.manifest import PolicyError, naming, upgrade
 from mjx_balance.policy.network import Policy
 from mjx_balance.runtime import MOST_BYTES, MOST_HEADER, MOST_MANIFEST, MOST_WEIGHTS
-from mjx_balance.text import quote
 
 
 def flat_weights(params: Mapping[str, Any]) -> dict[str, np.ndarray]:

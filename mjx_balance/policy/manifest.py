@@ -12,13 +12,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mjx_balance.config import ACTION_AXES, Config, check, from_dict, to_dict
-from mjx_balance.errors import InputError
+from mjx_balance.errors import InputError, quote
 from mjx_balance.files.validation import parse
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import check_body, check_robot
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import Row, input_rows
-from mjx_balance.text import quote
 
 FORMAT, FORMAT_VERSION = "mjx_balance.policy", 5
 CONVERTIBLE = 4  #: older version that `upgrade` converts

@@ -9,10 +9,10 @@ from typing import Any, Self
 import numpy as np
 
 from mjx_balance.config import check, to_dict
+from mjx_balance.errors import quote
 from mjx_balance.policy import heads
 from mjx_balance.policy.manifest import PolicyError, describe, network_factors, read_manifest
 from mjx_balance.task.actions import action_table
-from mjx_balance.text import quote
 
 
 class Policy:

@@ -23,9 +23,9 @@ import mujoco
 import numpy as np
 
 from mjx_balance.config import TaskConfig, from_dict, to_dict
+from mjx_balance.errors import MESSAGE, shorten
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.sim.scene import Scene, build_model
-from mjx_balance.text import MESSAGE, shorten
 
 FPS = 25
 VIDEO_SIZE = (960, 544)

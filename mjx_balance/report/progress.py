@@ -14,8 +14,8 @@ from rich.markup import escape
 from rich.panel import Panel
 from rich.table import Table
 
+from mjx_balance.errors import printable
 from mjx_balance.evaluation.suites import HEADLINE
-from mjx_balance.text import printable
 
 PLAIN_INTERVAL = 5.0  #: seconds between two plain lines
 METRICS = {

@@ -10,12 +10,11 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic import WrapValidator
 
 from mjx_balance.config import Config, read_config
-from mjx_balance.errors import InputError
+from mjx_balance.errors import MESSAGE, InputError, quote, shorten
 from mjx_balance.files.run_folder import RunFolder, check_contained, parse_json, read_json
 from mjx_balance.files.validation import STRICT, parse
 from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report.figures import CURVES, HELD_OUT
-from mjx_balance.text import MESSAGE, quote, shorten
 
 METRICS_BYTES = 8 * 2**20  #: bytes of metrics.jsonl that are read; the rest is ignored
 LINE_BYTES = 2**18  #: greatest length of a line of metrics.jsonl

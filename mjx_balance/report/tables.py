@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mjx_balance.errors import PATH, shell, shorten
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.robots.catalogue import shipped
-from mjx_balance.text import PATH, shell, shorten
 
 STATISTICS = ("mean", "p50", "p95", "p99", "max")  #: tilt statistics in the table of an evaluation
 

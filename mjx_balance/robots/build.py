@@ -12,11 +12,11 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_balance.errors import MESSAGE, quote, shorten
 from mjx_balance.robots.measure import check_joints, measure, pose
 from mjx_balance.robots.model import FRESH, Coupling, compile_model, model_path, naming, read_model
 from mjx_balance.robots.robot import Robot, per_joint
 from mjx_balance.robots.schema import FixedJoint, Foot, LegFile, RobotError, RobotFile
-from mjx_balance.text import MESSAGE, quote, shorten
 
 VISUAL_GROUP, FOOT_GROUP = 2, 3
 GYRO, ACCELEROMETER = "gyro", "accelerometer"

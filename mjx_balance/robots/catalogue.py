@@ -5,12 +5,12 @@ from pathlib import Path
 
 import mujoco
 
+from mjx_balance.errors import quote
 from mjx_balance.robots.build import build
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.model import model_path
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import RobotError, RobotFile, parse_robot_file, read_robot_file
-from mjx_balance.text import quote
 
 SHIPPED = Path(__file__).resolve().parent
 OURS = ("quadruped", "quadruped_soft")

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_balance.errors import quote, shorten
 from mjx_balance.robots.build import RADIUS_TOLERANCE, strip_elements
 from mjx_balance.robots.measure import ancestors
 from mjx_balance.robots.model import compile_model, naming, read_model
 from mjx_balance.robots.schema import RobotError, parse_robot_file
-from mjx_balance.text import quote, shorten
 
 HEADER = """\
 # Drafted from the model's structure; a corner's letters say front or rear, left or right.

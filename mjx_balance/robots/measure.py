@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 
 from mjx_balance.config.schema import GRAVITY
+from mjx_balance.errors import quote
 from mjx_balance.files.validation import check_types
 from mjx_balance.robots.model import JOINT_ACTUATORS
 from mjx_balance.robots.robot import OUR_LEVER, OUR_MASS, Body, Leg, Robot
 from mjx_balance.robots.schema import LegFile, RobotError, RobotFile
-from mjx_balance.text import quote
 
 LEVEL = math.cos(math.radians(1.0))  #: of the greatest angle of a joint's axis to the trunk's
 SLACK = 1e-3  #: tolerance of an abduction's limits, rad

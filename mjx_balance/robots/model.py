@@ -14,11 +14,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_balance.errors import how_to_install
+from mjx_balance.errors import MESSAGE, how_to_install, quote, shorten
 from mjx_balance.robots import urdf
 from mjx_balance.robots.robot import MOST
 from mjx_balance.robots.schema import RobotError
-from mjx_balance.text import MESSAGE, quote, shorten
 
 JOINT_ACTUATORS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 FRESH = mujoco.MjSpec()  #: MuJoCo's own defaults, for elements that we add to a maker's model

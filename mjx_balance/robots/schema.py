@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from annotated_types import Gt, Le, Len, MinLen
 
 from mjx_balance.config import ConfigError
+from mjx_balance.errors import MESSAGE, printable, quote, shorten
 from mjx_balance.files.validation import STRICT, parse
 from mjx_balance.robots.robot import MOST, Delay, Number
-from mjx_balance.text import MESSAGE, printable, quote, shorten
 
 MAX_FILE = 2**20  #: greatest size of a robot file, bytes
 Name = Annotated[str, MinLen(1)]

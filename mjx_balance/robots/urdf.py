@@ -6,8 +6,8 @@ import shlex
 from pathlib import Path
 from xml.etree import ElementTree
 
+from mjx_balance.errors import MESSAGE, shorten
 from mjx_balance.robots.schema import RobotError
-from mjx_balance.text import MESSAGE, shorten
 
 
 def read(path: Path, visual: bool) -> str:

@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from mjx_balance.config import ConfigError, TaskConfig
+from mjx_balance.errors import quote
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
-from mjx_balance.text import quote
 
 ACTIONS = ("discrete", "continuous")  #: table index; shares of `action_max`, -1 to 1
 

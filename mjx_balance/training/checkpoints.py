@@ -18,8 +18,7 @@ from typing import Any, TypeVar, cast
 
 import orbax.checkpoint as ocp
 
-from mjx_balance.errors import InputError
-from mjx_balance.text import MESSAGE, PATH, shorten
+from mjx_balance.errors import MESSAGE, PATH, InputError, shorten
 from mjx_balance.training.processes import ALONE, Processes
 
 T = TypeVar("T")

@@ -8,13 +8,13 @@ from typing import Any
 from mjx_balance.config import Config, ConfigError, sweep_grid
 from mjx_balance.dqn import TrainState
 from mjx_balance.dqn.dqn import Params
+from mjx_balance.errors import MESSAGE, shorten
 from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.statistics import over_seeds
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import RunFolder, write_atomically, write_json
 from mjx_balance.policy.file import Policy, PolicyError, load_policy, save_policy
 from mjx_balance.report import tables
-from mjx_balance.text import MESSAGE, shorten
 from mjx_balance.training.loop import Run
 from mjx_balance.training.tensorboard import Board
 from mjx_balance.training.validation import Results, best_validated, exports, scalars, score

@@ -17,9 +17,8 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar
 
-from mjx_balance.errors import FAILED, InputError
+from mjx_balance.errors import FAILED, MESSAGE, InputError, shorten
 from mjx_balance.files.validation import STRICT, parse
-from mjx_balance.text import MESSAGE, shorten
 
 HELLO_S, LINE_BYTES, CALLERS = 5, 2**16, 100
 """Seconds for a hello; its greatest length; callers that may be about to say one: the oldest go."""

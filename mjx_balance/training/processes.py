@@ -15,9 +15,8 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from mjx_balance.errors import FAILED, INTERRUPTED
+from mjx_balance.errors import FAILED, INTERRUPTED, MESSAGE, quote, shorten
 from mjx_balance.machine import core_ids, cores
-from mjx_balance.text import MESSAGE, quote, shorten
 from mjx_balance.training.meeting import Member, ProcessError, Watch, host, listen, visit
 
 T = TypeVar("T")

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import jax
 
+from mjx_balance.errors import shorten
 from mjx_balance.files.run_folder import write_json
-from mjx_balance.text import shorten
 from mjx_balance.training.program_cache import CompiledProgram
 
 MEANING = {

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import export
 
 from mjx_balance.config import Config, to_dict
+from mjx_balance.errors import shorten
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.files.sources import code
 from mjx_balance.machine import cores
@@ -29,7 +30,6 @@ from mjx_balance.robots.catalogue import robot_xml
 from mjx_balance.sim.engines import ffi
 from mjx_balance.sim.engines.table import ENGINES
 from mjx_balance.sim.scene import scene_dir
-from mjx_balance.text import shorten
 
 LIBRARIES = ("mjx_balance", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax")
 """What a run's bits depend on besides this package's code."""

@@ -13,13 +13,13 @@ from mjx_balance.config import Config, ConfigError, flatten, to_dict
 from mjx_balance.config.serialization import check_same_config, read_run_config
 from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.errors import shell
 from mjx_balance.files import run_folder
 from mjx_balance.files.run_folder import RunFolder, RunFolderError, RunFolderExistsError
 from mjx_balance.machine import cores
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report.progress import Display
 from mjx_balance.sim.engines.table import ENGINES
-from mjx_balance.text import shell
 from mjx_balance.training import checkpoints, finish, profiling, program_cache, sizing
 from mjx_balance.training.loop import Interrupts, Program, Run, learn, number
 from mjx_balance.training.processes import Cluster, Interrupted, Processes, joined

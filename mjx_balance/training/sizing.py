@@ -14,11 +14,11 @@ from mjx_balance.config import Config, ConfigError, check, expand_runs, preset, 
 from mjx_balance.dqn import DQN, DQNSpec, QNetwork
 from mjx_balance.dqn.mesh import REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
+from mjx_balance.errors import quote, shorten
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.machine import available_memory, cores, share_heap
 from mjx_balance.policy.manifest import network_factors
 from mjx_balance.sim.engines.table import check_platform
-from mjx_balance.text import quote, shorten
 from mjx_balance.training.program_cache import LogFn, cache_dir, enable_compilation_cache
 
 SIZES_FILE = "sizes.json"  #: in the cache: numbers of envs by device and engine, as measured

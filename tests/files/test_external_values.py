@@ -11,9 +11,8 @@ from annotated_types import Ge, Gt, Len, MinLen
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mjx_balance.errors import InputError
+from mjx_balance.errors import InputError, quote, shell, shorten
 from mjx_balance.files.validation import STRICT, check_types, parse
-from mjx_balance.text import quote, shell, shorten
 
 
 @pytest.mark.parametrize(
