@@ -292,7 +292,7 @@ def _settle(layout: Layout) -> Stance:
     """
     data, trim = _rest(layout, np.ones((len(layout.leg_ctrl), 3)))
     if not (_is_still(layout, data) and _is_at_targets(layout, data)):
-        data, trim = _rest(layout, np.maximum(_too_soft_by(layout), 1))
+        data, trim = _rest_carried(layout)
         if not _endures(layout, data):
             raise ConfigError(_why_unsettled(layout))
     state = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
@@ -326,6 +326,11 @@ def _rest(
     data.qpos[root : root + 2] = 0
     _step(model, data, SETTLE_STEPS)
     return data, trim
+
+
+def _rest_carried(layout: Layout) -> tuple[mujoco.MjData, Float[np.ndarray, "legs 3"]]:
+    """`_rest` with servos that are at first as stiff as our own robot's, relative to its weight."""
+    return _rest(layout, np.maximum(_too_soft_by(layout), 1))
 
 
 def _step(model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> None:
@@ -392,9 +397,9 @@ def _why_unsettled(layout: Layout) -> str:
     """Says that the robot does not stand, and why, as far as one can tell."""
     robot, height = layout.robot, layout.task.body_height
     limits = layout.model.actuator_forcerange[layout.leg_ctrl, 1]
-    # Servos that are far too stiff reach their limits in any case: the rules' servos tell.
-    model = _with_gains(layout, _too_soft_by(layout))
-    data, _ = _rest(dataclasses.replace(layout, model=model), np.ones(limits.shape))
+    # Servos that are far too stiff reach their limits in any case.
+    gentle = _with_gains(layout, np.minimum(_too_soft_by(layout), 1))
+    data, _ = _rest_carried(dataclasses.replace(layout, model=gentle))
     share = np.abs(data.actuator_force[layout.leg_ctrl]) / limits
     if share.max() > 0.99:
         leg, joint = np.unravel_index(np.argmax(share), share.shape)
@@ -433,7 +438,7 @@ def _why_too_soft(layout: Layout) -> str:
 
     def stands(factor: float) -> bool:
         stiffer = dataclasses.replace(layout, model=_with_gains(layout, factor))
-        data, _ = _rest(stiffer, np.maximum(_too_soft_by(stiffer), 1))
+        data, _ = _rest_carried(stiffer)
         return _endures(stiffer, data)
 
     if most <= 1 or not stands(most):
