@@ -14,6 +14,7 @@ from typing import Any
 import imageio_ffmpeg
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -33,7 +34,8 @@ os.environ.setdefault("XLA_FLAGS", XLA_FLAGS)
 # through them for a tenth of the time.
 gc.set_threshold(100_000, 20, 100)
 
-
+CHECKED = ("task", "sim", "envs")
+"""Folders whose tests check the shapes in annotations; that takes half as long again."""
 FLEET = (
     "test_engines",
     "test_compiled_engine",
@@ -68,6 +70,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return "fleet" if Path(file).stem in FLEET else file
 
     return ByFile(config, log)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Checks shapes where the functions that have them are tested."""
+    jaxtyping.config.update("jaxtyping_disable", item.path.parent.name not in CHECKED)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

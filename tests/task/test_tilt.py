@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
 
 from mjx_balance.config import TaskConfig
 from mjx_balance.config.sea import ACCELERATION, GRAVITY, check_platform, significant_angle
@@ -270,6 +271,12 @@ def test_a_platform_moves_as_the_surface_of_the_sea() -> None:
     heave_rate = np.gradient(position[:, 2], time)[1:-1]
     np.testing.assert_allclose(heave_rate, -9.81 / one.omega[0] * rising[1:-1], atol=1e-3)
     assert np.ptp(heave_rate) > 0.02
+
+
+def test_tests_check_shapes() -> None:
+    """Three directions and four magnitudes, of which NumPy would complain in its own words."""
+    with pytest.raises(TypeCheckError, match="Expected type"):
+        disc_targets(np.asarray(7.0), np.zeros(3), np.zeros(4))
 
 
 def test_no_platform_falls_faster_than_the_bound() -> None:
