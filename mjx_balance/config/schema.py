@@ -76,7 +76,8 @@ class TaskConfig:
     one, the scene has no joints for it."""
     sea_height: NonNegative = 1.0
     """Significant height of the platform's heave, crest to trough, m; along the heading it surges
-    and sways by the same (chosen: a slight sea)."""
+    and sways by the same (chosen: a slight sea). In training, the greatest: every sea has its own
+    height, uniform from 0."""
     sea_heading: Annotated[float, Ge(-360), Le(360)] | None = None
     """Mean direction in which the waves run, deg from straight ahead to the left; none: any."""
     start_incline: Annotated[float, Ge(0), Lt(90)] = 0.0
@@ -206,6 +207,9 @@ class RandomizationConfig:
     """Greatest sliding friction of the feet; none: the robot's foot_friction."""
     gain_spread: Annotated[float, Ge(0), Lt(1)] = 0.0
     """Greatest relative deviation of the servo gains."""
+    soft_share: Share = 0.0
+    """Share of the envs whose servos are softer than the robot's, at most as soft as those of
+    `quadruped_soft` for its weight."""
     event_payload: NonNegative = 0.0
     """Greatest mass on the trunk from the middle of an episode on, kg; 0: the load stays."""
     event_grip: Annotated[float, Gt(0), Le(1)] = 1.0
@@ -229,9 +233,10 @@ class RandomizationConfig:
     @property
     def varies(self) -> bool:
         """Whether envs differ; the payload's offset and height matter only with a payload."""
-        shares = self.gain_spread, self.latency_share, self.sensors_err, self.happens
+        shares = self.gain_spread, self.soft_share, self.latency_share
         sizes = self.gyro_noise, self.accel_noise, self.payload, self.push_max
-        return any((*shares, *sizes)) or (self.friction_min, self.friction_max) != (None, None)
+        frictions = self.friction_min is not None, self.friction_max is not None
+        return any((*shares, *sizes, *frictions, self.sensors_err, self.happens))
 
     @property
     def sensors_err(self) -> bool:

@@ -14,7 +14,7 @@ from mjx_balance.task import events
 from mjx_balance.task.actions import action_table, check_action
 from mjx_balance.task.observation import input_rows
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
-from mjx_balance.task.randomization import DRAWS, draw_params
+from mjx_balance.task.randomization import draw_params, param_draws
 from mjx_balance.task.reward import reward_rows
 from mjx_balance.task.sensors import count_draws, draw_decision, draw_errors, joint_readings
 from mjx_balance.task.step import EnvState, initial_memory, observation, step
@@ -109,7 +109,7 @@ class BalanceEnv(Env):
             "truncation": jnp.float32(0.0),
         }
         if ranges.varies:
-            draws = jax.random.uniform(key_params, (DRAWS,), jnp.float32)
+            draws = jax.random.uniform(key_params, (param_draws(ranges),), jnp.float32)
             params = draw_params(ranges, robot, draws)
             info["noise_key"] = key_noise
         if ranges.sensors_err:

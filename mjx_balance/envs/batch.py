@@ -12,7 +12,7 @@ from mjx_balance.sim.engines.mujoco import MujocoEngine
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task import events
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
-from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
+from mjx_balance.task.randomization import DomainParams, draw_params, param_draws
 from mjx_balance.task.sensors import (
     SensorErrors,
     count_draws,
@@ -55,7 +55,8 @@ def draw_episodes(
     params, pushes, errors, event = None, None, None, None
     scenarios = [draw_scenario(task, numpy_uniform(rng)) for rng in rngs]
     if ranges.varies:
-        params = draw_params(ranges, robot, np.stack([rng.uniform(size=DRAWS) for rng in rngs]))
+        count = param_draws(ranges)
+        params = draw_params(ranges, robot, np.stack([rng.uniform(size=count) for rng in rngs]))
     if len(due):
         uniform = np.stack([rng.uniform(size=(len(due), 2)) for rng in rngs])
         pushes = Pushes(draw_velocity(ranges, uniform), np.tile(due, (len(rngs), 1)))

@@ -7,11 +7,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_balance.sim.scene import Scene
+from mjx_balance.sim.scene import Scene, leg_dofs, soft_factors
 from mjx_balance.task import Array
 from mjx_balance.task.randomization import DomainParams
 
-MODEL_PARAMS = ("payload", "payload_at", "friction", "gain")  #: parameters that change the model
+MODEL_PARAMS = ("payload", "payload_at", "friction", "gain", "softness")
+"""Parameters that change the model."""
 
 
 def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
@@ -29,8 +30,14 @@ def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
     spread = xp.sum(arm**2, axis=-1, keepdims=True) - arm**2
     inertia = model.body_inertia[trunk] + mass * load / (mass + load) * spread
     friction = params.friction[..., None] * np.ones(2)
-    gain = params.gain.reshape(*params.payload.shape, -1)
-    stiffness = model.actuator_gainprm[legs, 0] * gain
+
+    def flat(values: Array) -> Array:
+        return values.reshape(*params.payload.shape, -1)
+
+    softness, dofs = params.softness[..., None, None], leg_dofs(model, scene.leg_ctrl).ravel()
+    softer, damped = (factor**softness for factor in soft_factors(scene.robot))
+    stiffness = model.actuator_gainprm[legs, 0] * flat(params.gain * softer)
+    damping = model.dof_damping[dofs] * flat(np.ones(scene.leg_ctrl.shape) * damped)
 
     def put(field: np.ndarray, where: tuple[Any, ...], value: Array) -> Array:
         base = xp.zeros((*value.shape[: params.payload.ndim], *field.shape)) + field
@@ -44,6 +51,7 @@ def randomized_fields(scene: Scene, params: DomainParams) -> dict[str, Array]:
         "body_mass": put(model.body_mass, (trunk,), (mass + load)[..., 0]),
         "body_ipos": put(model.body_ipos, (trunk, slice(None)), moved),
         "body_inertia": put(model.body_inertia, (trunk, slice(None)), inertia),
+        "dof_damping": put(model.dof_damping, (dofs,), damping),
         "body_invweight0": of_bodies,
         "dof_invweight0": of_dofs,
         "actuator_gainprm": put(model.actuator_gainprm, (legs, 0), stiffness),

@@ -22,6 +22,7 @@ from mjx_balance.robots.robot import gain_text, per_joint
 from mjx_balance.task import Array
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
+from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.step import Targets
 
 ROBOT, BOARD, PLATFORM = "robot/", "board/", "platform/"
@@ -84,9 +85,18 @@ class Scene(Layout):
 
     stance: Stance
 
-    def ctrl(self, targets: Targets) -> Float[Array, "*batch sim_steps nu"]:
-        """Servo targets in the model's order, rad, and m of a platform."""
-        joints = targets.joints + self.stance.leg_trim.astype(targets.joints.dtype)
+    def ctrl(
+        self, targets: Targets, params: DomainParams | None = None
+    ) -> Float[Array, "*batch sim_steps nu"]:
+        """Servo targets in the model's order, rad, and m of a platform.
+
+        Softer servos need more trim for the same torque.
+        """
+        trim: Array = self.stance.leg_trim.astype(targets.joints.dtype)
+        if params is not None:
+            stiffness, _ = soft_factors(self.robot).astype(trim.dtype)
+            trim = trim / stiffness ** params.softness[..., None, None, None]
+        joints = targets.joints + trim
         xp = joints.__array_namespace__()
         flat = (targets.board, joints.reshape(*joints.shape[:-2], -1))
         servos = (self.board_ctrl, self.platform_ctrl, self.leg_ctrl.ravel())
@@ -259,26 +269,32 @@ def load_scene(config: Config, visual: bool = False) -> Scene:
     return Scene(**vars(layout), stance=_settle(layout))
 
 
-def soften(scene: Scene) -> Scene:
-    """The scene with servos as soft as those of `quadruped_soft`.
+def soft_factors(robot: Robot) -> Float[np.ndarray, "2 3"]:
+    """Stiffness and damping of soft servos, relative to the robot's own; at most 1.
 
-    Stiffness and damping are its own times weight and leg length relative to ours; servos that are
-    softer already stay as they are.
+    They are those of `quadruped_soft` times weight and leg length relative to ours.
+    """
+    soft, scale = find_robot("quadruped_soft"), _weight_scale(robot)
+    names = ("servo_stiffness", "servo_damping")
+    softer = [scale * getattr(soft, name) / per_joint(getattr(robot, name)) for name in names]
+    return np.minimum(softer, 1.0)
+
+
+def soften(scene: Scene) -> Scene:
+    """The scene with soft servos (`soft_factors`).
 
     Raises:
       ConfigError: if the robot does not stand.
     """
-    model, servos = copy.copy(scene.model), scene.leg_ctrl
-    soft, scale = find_robot("quadruped_soft"), _weight_scale(scene.robot)
-    stiffness, damping = (
-        np.minimum(per_joint(getattr(scene.robot, name)), scale * getattr(soft, name))
-        for name in ("servo_stiffness", "servo_damping")
-    )
+    model, servos, robot = copy.copy(scene.model), scene.leg_ctrl, scene.robot
+    stiffness, damping = soft_factors(robot)
+    stiffness = stiffness * per_joint(robot.servo_stiffness)
+    damping = damping * per_joint(robot.servo_damping)
     model.actuator_gainprm[servos, 0] = stiffness
     model.actuator_biasprm[servos, 1] = -stiffness
-    model.dof_damping[_leg_dofs(model, servos)] = damping
+    model.dof_damping[leg_dofs(model, servos)] = damping
     robot = dataclasses.replace(
-        scene.robot, servo_stiffness=tuple(stiffness), servo_damping=tuple(damping)
+        robot, servo_stiffness=tuple(stiffness), servo_damping=tuple(damping)
     )
     softer = dataclasses.replace(scene, model=model, robot=robot)
     return dataclasses.replace(softer, stance=_settle(softer))
@@ -315,8 +331,8 @@ def _rest(
     data.qpos[root : root + 7] = (0, 0, height, 1, 0, 0, 0)
     data.qpos[legs] = angles
     stiff = _with_gains(layout, stiffer)
-    stiff.dof_damping[_leg_dofs(model, servos)] *= stiffer
-    stiff.dof_armature[_leg_dofs(model, servos)] *= stiffer  # or they would be too fast for a step
+    stiff.dof_damping[leg_dofs(model, servos)] *= stiffer
+    stiff.dof_armature[leg_dofs(model, servos)] *= stiffer  # or they would be too fast for a step
     for _ in range(SETTLE_ROUNDS):
         data.ctrl[servos] = angles + trim
         _step(stiff, data, SETTLE_STEPS)
@@ -359,7 +375,7 @@ def _weight_scale(robot: Robot) -> float:
     return robot.mass_scale * robot.leg_length / OUR_LEG
 
 
-def _leg_dofs(model: mujoco.MjModel, servos: Int[np.ndarray, "legs 3"]) -> np.ndarray:
+def leg_dofs(model: mujoco.MjModel, servos: Int[np.ndarray, "legs 3"]) -> np.ndarray:
     """Addresses in qvel of the joints that the servos move."""
     return model.jnt_dofadr[model.actuator_trnid[servos, 0]]
 

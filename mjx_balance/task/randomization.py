@@ -9,7 +9,7 @@ from mjx_balance.config import RandomizationConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
 
-DRAWS = 6  #: uniform random numbers that the parameters of one env take
+DRAWS = 6  #: uniform random numbers that the parameters of one env take, but for softness
 
 
 class DomainParams(NamedTuple):
@@ -21,12 +21,18 @@ class DomainParams(NamedTuple):
     friction: Float[Array, "*batch legs"]  #: sliding friction of every foot
     gain: Float[Array, "*batch legs 3"]  #: factor on the position gain of every leg servo
     delay: Float[Array, "*batch"]  #: decisions between choosing an action and taking it, 0 or 1
+    softness: Float[Array, "*batch"]  #: of the servos, 0: the robot's, 1: `sim.scene.soft_factors`
+
+
+def param_draws(ranges: RandomizationConfig) -> int:
+    """Uniform random numbers that `draw_params` takes for one env."""
+    return DRAWS + (ranges.soft_share > 0)
 
 
 def draw_params(
     ranges: RandomizationConfig, robot: Robot, uniform: Float[Array, "*batch draws"]
 ) -> DomainParams:
-    """Turns `DRAWS` random numbers in [0, 1) into domain parameters; `robot` has the friction."""
+    """Turns `param_draws` random numbers in [0, 1) into domain parameters of a robot."""
     xp = uniform.__array_namespace__()
     u = xp.moveaxis(uniform, -1, 0)
     sigma = np.asarray([ranges.gyro_noise] * 3 + [ranges.accel_noise] * 3, uniform.dtype)
@@ -34,7 +40,7 @@ def draw_params(
     at = offset * (2 * u[1] - 1), offset * (2 * u[2] - 1), 0 * u[0] + ranges.payload_height
     friction_min = robot.foot_friction if ranges.friction_min is None else ranges.friction_min
     friction_max = robot.foot_friction if ranges.friction_max is None else ranges.friction_max
-    legs = np.ones(len(robot.legs), uniform.dtype)
+    legs, share = np.ones(len(robot.legs), uniform.dtype), ranges.soft_share
     return DomainParams(
         imu_noise=xp.zeros_like(u[0])[..., None] + sigma,
         payload=ranges.payload * u[0],
@@ -44,4 +50,5 @@ def draw_params(
         * legs[:, None]
         * np.ones(3, uniform.dtype),
         delay=(u[5] < ranges.latency_share).astype(uniform.dtype),
+        softness=xp.where(u[-1] < share, u[-1] / share, 0.0) if share else 0 * u[0],
     )

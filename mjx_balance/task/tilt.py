@@ -77,7 +77,8 @@ def platform_position(
 ) -> Float[Array, "*batch times 3"]:
     """Surge, sway and heave of the platform, m, at times since the start, s."""
     if scenario.waves is None:
-        return (0 * time)[..., None] + 0 * scenario.targets[..., :1, :1] + np.zeros(3, time.dtype)
+        shape = np.broadcast_shapes(time.shape, (*scenario.phase.shape, 1))
+        return time.__array_namespace__().zeros((*shape, 3), dtype=time.dtype)
     return _at_sea(task, scenario.waves, time, slice(2, 5))
 
 
@@ -131,8 +132,9 @@ def disc_targets(
 def draw_scenario(task: TaskConfig, uniform: Uniform) -> Scenario:
     """Draws one scenario of training, long enough for an episode.
 
-    With several kinds of motion each is drawn equally often. Ramps alone have no waves. A board
-    that starts tilted stays so until its second target.
+    With several kinds of motion each is drawn equally often. Ramps alone have no waves. A platform
+    moves by a share of its height, uniform in [0, 1). A board that starts tilted stays so until its
+    second target.
 
     Args:
       task: kinds of motion and their numbers, the episode's length.
@@ -140,6 +142,10 @@ def draw_scenario(task: TaskConfig, uniform: Uniform) -> Scenario:
         the calls always come in the same order.
     """
     scenario = _draw_motion(task, uniform)
+    if task.platform and scenario.waves is not None:
+        height, amplitude = uniform((), 0.0, 1.0), scenario.waves.amplitude
+        factors = amplitude.__array_namespace__().where(np.arange(5) < 2, 1.0, height)
+        scenario = scenario._replace(waves=scenario.waves._replace(amplitude=amplitude * factors))
     if not task.start_incline:
         return scenario
     draws = uniform((2,), 0.0, 1.0)

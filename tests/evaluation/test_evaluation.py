@@ -74,7 +74,7 @@ def nominal(count: int) -> DomainParams:
     """Parameters that change nothing."""
     zero, friction, gain = np.zeros(count), np.full((count, 4), 0.8), np.ones((count, 4, 3))
     noise, at = np.zeros((count, 6)), np.zeros((count, 3))
-    return DomainParams(noise, zero, at, friction, gain, delay=zero)
+    return DomainParams(noise, zero, at, friction, gain, delay=zero, softness=zero)
 
 
 def tilts(scene: Scene, qpos: np.ndarray) -> np.ndarray:

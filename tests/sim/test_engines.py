@@ -274,6 +274,7 @@ def test_domain_parameters_are_those_of_models_made_so(scene: Scene) -> None:
         friction=np.asarray(((0.5, 0.6, 0.7, 0.8), (0.9, 0.4, 0.9, 0.9))),
         gain=np.linspace(0.7, 1.1, 24).reshape(2, 4, 3),
         delay=np.zeros(2),
+        softness=np.zeros(2),
     )
     engine = MujocoEngine(scene, 2, threads=1)
     hold = np.zeros(scene.model.nu)

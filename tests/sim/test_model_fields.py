@@ -1,5 +1,6 @@
 """Fields of a loaded robot's model, against MuJoCo's own set-up of it."""
 
+import math
 import types
 
 import jax
@@ -10,10 +11,13 @@ from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import RandomizationConfig, preset
+from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.domain_randomization import randomized_fields
+from mjx_balance.sim.engines.mujoco import MujocoEngine
 from mjx_balance.sim.scene import Scene, load_scene
 from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
+from mjx_balance.task.step import Targets
 
 WORST = RandomizationConfig(payload=8.0, payload_offset=0.1, friction_min=0.3, gain_spread=0.3)
 
@@ -71,6 +75,7 @@ THREE = DomainParams(
     friction=np.asarray(((0.8,) * 4, (0.4,) * 4, (0.6, 0.5, 0.4, 0.3))),
     gain=np.asarray((np.ones((4, 3)), np.full((4, 3), 1.1), np.arange(1, 13).reshape(4, 3) / 10)),
     delay=np.zeros(3),
+    softness=np.zeros(3),
 )
 """Nominal; loaded off the centre; loaded on the axis, every foot and servo in its own way."""
 
@@ -98,6 +103,35 @@ def test_friction_and_gain_reach_every_foot_and_leg_and_nothing_else(scene: Scen
         ours, nominal = fields[name], getattr(model, name)
         others = np.arange(model.nbody) != trunk
         np.testing.assert_array_equal(ours[:, others], np.stack([nominal[others]] * 3))
+
+
+def test_soft_servos_are_a_softer_robots_and_hold_it_where_it_stands(scene: Scene) -> None:
+    """Gains between those of two robot files; half soft is their geometric mean.
+
+    The trim of the stiff servos would let the soft ones sag by 6.7 times their own error.
+    """
+    soft = find_robot("quadruped_soft")
+    assert (soft.servo_stiffness, soft.servo_damping) == (60.0, 4.0)  # ours has 400 and 16
+    params = THREE._replace(
+        payload=np.zeros(3), friction=np.full((3, 4), 0.8), gain=np.ones((3, 4, 3))
+    )._replace(softness=np.asarray((0.0, 0.5, 1.0)))
+    fields = randomized_fields(scene, params)
+    legs = scene.leg_ctrl.ravel()
+    stiffness = fields["actuator_gainprm"][:, legs, 0]
+    np.testing.assert_allclose(stiffness, [[x] * 12 for x in (400, math.sqrt(24_000), 60)])
+    np.testing.assert_allclose(fields["actuator_biasprm"][:, legs, 1], -stiffness)
+    dofs = [scene.model.joint(f"robot/{n}").dofadr[0] for x in scene.robot.legs for n in x.joints]
+    np.testing.assert_allclose(fields["dof_damping"][:, dofs], [[x] * 12 for x in (16, 8, 4)])
+    others = np.setdiff1d(np.arange(scene.model.nv), dofs)
+    np.testing.assert_array_equal(
+        fields["dof_damping"][:, others], [scene.model.dof_damping[others]] * 3
+    )
+    engine, angles = MujocoEngine(scene, 3, threads=1), scene.stance.qpos[scene.leg_qpos]
+    still = Targets(np.zeros((3, 500, 2)), np.broadcast_to(angles, (3, 500, 4, 3)))
+    engine.advance(np.arange(3), still, params)
+    own, *softer = engine.recorded["qpos"]
+    np.testing.assert_allclose(softer, [own] * 2, atol=2e-4)
+    assert np.abs(scene.stance.leg_trim).max() > 0.01
 
 
 def test_nominal_params_are_the_model_and_one_env_in_jax_is_its_row(scene: Scene) -> None:

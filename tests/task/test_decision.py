@@ -73,7 +73,7 @@ def before(
     """States of robots at decisions `env_steps`; delay None: no domain parameters."""
     params = None
     if delay is not None:
-        params = DomainParams(*[np.zeros(len(env_steps))] * 6)._replace(delay=np.asarray(delay))
+        params = DomainParams(*[np.zeros(len(env_steps))] * 7)._replace(delay=np.asarray(delay))
     memory = random_memory() if memory is None else memory
     return step.EnvState(np.zeros(()), memory, scenario, np.asarray(env_steps), params, None)
 

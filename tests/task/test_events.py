@@ -32,6 +32,7 @@ BEFORE = DomainParams(
     friction=np.full((2, 4), 0.8),
     gain=np.full((2, 4, 3), 0.9),
     delay=np.zeros(2),
+    softness=np.zeros(2),
 )
 
 

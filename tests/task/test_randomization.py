@@ -9,7 +9,7 @@ import pytest
 
 from mjx_balance.config import RandomizationConfig
 from mjx_balance.robots.catalogue import Robot
-from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params
+from mjx_balance.task.randomization import DRAWS, DomainParams, draw_params, param_draws
 
 RANDOM = RandomizationConfig(
     gyro_noise=0.01,
@@ -67,13 +67,23 @@ def test_the_paper_leaves_everything_as_it_is(robot: Robot) -> None:
     assert (set(got.friction.ravel()), set(got.gain.ravel())) == ({0.8}, {1.0})
 
 
+def test_a_share_of_the_envs_has_softer_servos(robot: Robot) -> None:
+    """Of softness uniform in [0, 1); the number is drawn after all others."""
+    ranges = RandomizationConfig(soft_share=0.4)
+    assert ranges.varies
+    assert (param_draws(ranges), param_draws(RandomizationConfig())) == (7, 6)
+    uniform = np.zeros((4, 7))
+    uniform[:, 6] = 0.0, 0.1, 0.39, 0.41
+    np.testing.assert_allclose(draw_params(ranges, robot, uniform).softness, (0, 0.25, 0.975, 0))
+
+
 def test_a_batch_keeps_its_shape_and_type(
     xp: types.ModuleType, robot: Robot, compiled: Any
 ) -> None:
     uniform = xp.asarray(np.random.default_rng(0).uniform(size=(2, 3, DRAWS)), xp.float32)
     draw = compiled(partial(draw_params, RANDOM, robot))
     got = draw(uniform)
-    shapes = DomainParams((2, 3, 6), (2, 3), (2, 3, 3), (2, 3, 4), (2, 3, 4, 3), (2, 3))
+    shapes = DomainParams((2, 3, 6), (2, 3), (2, 3, 3), (2, 3, 4), (2, 3, 4, 3), (2, 3), (2, 3))
     assert DomainParams(*(value.shape for value in got)) == shapes
     assert {value.dtype for value in got} == {np.dtype(np.float32)}
     alone = draw(uniform[1, 2])

@@ -67,7 +67,7 @@ def nominal() -> DomainParams:
     """With noise alone."""
     zero, friction, gain = np.zeros(N), np.full((N, 4), 0.8), np.ones((N, 4, 3))
     noise = np.tile((0.001, 0.002, 0.003, 0.01, 0.02, 0.03), (N, 1))
-    return DomainParams(noise, zero, np.zeros((N, 3)), friction, gain, zero)
+    return DomainParams(noise, zero, np.zeros((N, 3)), friction, gain, zero, zero)
 
 
 def put(xp: types.ModuleType, tree: Any) -> Any:

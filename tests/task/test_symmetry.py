@@ -91,7 +91,7 @@ def loaded(side: float) -> DomainParams:
     load, at = np.asarray((3.0, 0.0)), np.tile((0.04, 0.05 * side, 0.08), (2, 1))
     friction, delay = np.full((2, 4), 0.7), np.asarray((0.0, 1.0))
     gain = np.asarray((0.9, 1.0))[:, None, None] * np.ones((4, 3))
-    return DomainParams(np.zeros((2, 6)), load, at, friction, gain, delay)
+    return DomainParams(np.zeros((2, 6)), load, at, friction, gain, delay, np.zeros(2))
 
 
 def test_the_robot_on_a_mirrored_board_sees_the_mirrored_world(

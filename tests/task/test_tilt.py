@@ -279,6 +279,23 @@ def test_tests_check_shapes() -> None:
         disc_targets(np.asarray(7.0), np.zeros(3), np.zeros(4))
 
 
+def test_a_platform_in_training_moves_by_a_share_of_its_height() -> None:
+    """Of another one in every episode, in all directions; the board turns as at sea.
+
+    A wave of a height of 0.8 m has an amplitude of 0.8 / 8 m.
+    """
+    task = dataclasses.replace(SEA, platform=True, sea_height=0.8)
+    waves, sea = drawn(task).waves, drawn(SEA).waves
+    assert waves is not None
+    assert sea is not None
+    np.testing.assert_array_equal(waves.amplitude[..., :2], sea.amplitude)
+    heave = waves.amplitude[..., 4]
+    np.testing.assert_allclose(heave, heave[:, :1].repeat(8, axis=1))
+    np.testing.assert_allclose(np.hypot(*waves.amplitude[..., 2:4].T).T, heave)
+    share = np.sort(heave[:, 0]) / 0.1
+    np.testing.assert_allclose(share, np.linspace(0, 1, 400), atol=0.1)  # uniform
+
+
 def test_no_platform_falls_faster_than_the_bound() -> None:
     """At the greatest height, with all waves aligned, it falls with g for a moment."""
     task = dataclasses.replace(SEA, platform=True, sea_period=5.0)

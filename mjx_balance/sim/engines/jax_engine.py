@@ -45,4 +45,4 @@ class JaxEngine:
     ) -> tuple[PhysicsState, Motion]:
         """Moves the physics by one decision."""
         with jax.named_scope("physics"):
-            return self.physics(physics, self.scene.ctrl(targets), params)
+            return self.physics(physics, self.scene.ctrl(targets, params), params)

@@ -25,8 +25,8 @@ class MujocoEngine:
         self.recorded: dict[str, np.ndarray] = {}  #: (n, sim_steps, ...) of the last decision
         self._size = count, threads or cores()
         self._batch = Batch(scene.model, *self._size)
-        # Payload and its place, friction of every foot, gain of every servo.
-        self._params = np.full((count, 4 + 4 * len(scene.leg_ctrl)), np.nan)
+        # Payload and its place, friction of every foot, gain of every servo, softness.
+        self._params = np.full((count, 5 + 4 * len(scene.leg_ctrl)), np.nan)
         self.reset(np.arange(count))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -69,7 +69,7 @@ class MujocoEngine:
         self, physics: Ids, targets: Targets, params: DomainParams | None
     ) -> tuple[Ids, Motion]:
         """Moves envs by one decision. An env that has had `params` always needs some."""
-        return physics, self.roll(physics, self.scene.ctrl(targets), params)
+        return physics, self.roll(physics, self.scene.ctrl(targets, params), params)
 
     def roll(
         self, ids: Ids, ctrl: Float[np.ndarray, "n sim_steps nu"], params: DomainParams | None
