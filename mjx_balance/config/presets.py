@@ -79,15 +79,16 @@ PRESETS: Mapping[str, Config] = {
     "paper": Config(preset="paper", num_envs=64),
     "default": Config(preset="default", num_env_steps=40_000, task=_TASK, dqn=_DQN),
     "best": _BEST,
-    # For a robot: sensors, encoders and commands that err, moving decks, tilted starts. The leaky
-    # means and filters show biases.
+    # For a robot: sensors, encoders, commands and servos that err, decks that move, things that
+    # happen, tilted starts. The leaky means and filters show biases.
     "real": dataclasses.replace(
         _BEST,
         preset="real",
-        num_env_steps=300_000,
+        num_env_steps=600_000,
         task=dataclasses.replace(
             _BEST.task,
             board_motions=("ramps", "sea", "steps"),
+            platform=True,
             start_incline=5.0,
             mean_times=(4.0, 20.0),
             filter_times=(1.0, 4.0),
@@ -104,6 +105,11 @@ PRESETS: Mapping[str, Config] = {
             command_jitter=0.01,
             dropout=0.1,
             ideal_share=0.4,
+            gain_spread=0.1,
+            soft_share=0.25,
+            event_payload=5.0,
+            event_grip=0.1,
+            event_strength=0.2,
         ),
         # Without it, mu is off by some 0.02 deg of tilt, from noise, and the robot stands so.
         dqn=dataclasses.replace(_BEST.dqn, zero_at_rest=True),
