@@ -14,6 +14,16 @@ The controller holds when a reading is impossible, or when the robot no longer b
 then stay the same until `reset`. The robot must be back at its standing height before `reset`. The
 servos need a watchdog in case the loop stops.
 
+Servos whose gains can be set let the robot stand up from where it lies, and lie down softly after
+a fall::
+
+    controller = Controller("policy.safetensors", gains=True)  # PASSIVE
+    while True:
+        if button:
+            controller.stand()
+        targets = controller.step(joint_positions, gyro, accelerometer)
+        send(targets, controller.stiffness, controller.damping, controller.torque)
+
 The manifest of the policy file describes the network's inputs row by row (`inputs`), so that this
 file needs no config.
 
@@ -40,6 +50,7 @@ ACTIONS = ("grid", "continuous")
 """Kinds of commands: rows of `actions.table_m`, or any within their range."""
 SENSORS = ("gyro", "accelerometer")
 ARGUMENTS = ("joint_positions", *SENSORS)  #: of `step`
+LOADS, UNITS = ("torques", "temperatures"), ("N m", "deg C")  #: also arguments of `step`
 IMU = 6  #: gyro x, y and z, accelerometer x, y and z
 MOST_BYTES = 64 * 2**20  #: greatest size of a policy file
 MOST_HEADER = 8 * 2**20  #: greatest size of its header
@@ -66,6 +77,18 @@ LIVELY = 1 / 3  #: least share of different ones; there the mean tilt is a fifth
 LIVELY_SENSOR = 1 / 5  #: least share of new values of gyro or accelerometer, of a robot that moves
 MOVED_LEAST = 0.003  #: motion of a joint that every gyro notices, rad; one still has few values
 LATE_SAMPLES = 5  #: greatest gap between calls, and error of a decision's length
+MOST_CALLS = 64  #: greatest number of calls per sample of the policy
+GAIN_RISE_S = 1.0  #: time in which the stiffness comes up before the robot stands up, s
+STAND_SPEED = 1.0  #: greatest speed of a joint's target while it stands up, rad/s
+STEEPEST = 15 / 8  #: greatest slope of x^3 (10 - 15 x + 6 x^2), the path's share of the way
+LEAST_MOVE_S = 0.5  #: least time of a move, so that a short one is no jerk, s
+STILL_RATE = 0.1  #: greatest gyro reading of a robot that stands still, rad/s
+TILT_MOST = 20.0  #: greatest tilt by the quaternion, deg; board and body together have 13 at most
+NORM_ERROR = 0.1  #: greatest error of a quaternion's norm
+TORQUE_SHARE = 0.95  #: greatest mean torque of a decision, as a share of the robot's limit
+TRIM_MOST = 1.0  #: greatest trim of a joint, rad; those of the shipped robots are below 0.2
+LOG_S, MOST_LOG = 60.0, 60_000  #: length of the log, s, and its greatest number of samples
+LOG_VERSION = 1
 
 
 class PolicyFileError(ValueError):
@@ -79,11 +102,53 @@ class State(str, enum.Enum):
 
     STANDING = "standing"  #: before the first sample; the targets are those of the standing robot
     BALANCING = "balancing"  #: the policy controls the robot
-    HOLDING = "holding"  #: the targets stay the same until `reset`
+    HOLDING = "holding"  #: targets and gains stay the same until `reset`
+    PASSIVE = "passive"  #: no gains; the targets follow the joints until `stand`
+    STANDING_UP = "standing_up"  #: the targets move to the standing pose, until the robot is still
+    DAMPING = "damping"  #: until `reset` the legs only damp; without stiffness and torque
+
+
+class Fault(enum.IntEnum):
+    """What was wrong; `RESPONSES` says what follows."""
+
+    NONE = 0
+    HELD = 1  #: the program called `hold`
+    DAMPED = 2  #: the program called `damp`
+    READING = 3  #: no numbers, another shape, or outside of a sensor's range
+    CLOCK = 4  #: the clock gives no time
+    LATE = 5  #: a sample came too late, or before the last one
+    RATE = 6  #: the samples of a decision took another time than in training
+    STALE = 7  #: the IMU repeats itself
+    STUCK = 8  #: a joint's reading stays the same while its target moves
+    NETWORK = 9  #: the network gives values that are not finite
+    WEIGHT = 10  #: the mean acceleration is far from 9.81 m/s^2
+    LEAN = 11  #: the mean acceleration leans too far
+    TUMBLING = 12  #: the mean angular rate is that of a fall
+    TILT = 13  #: the quaternion is tilted too far
+    AWAY = 14  #: a joint is far from its target
+    TORQUE = 15  #: a servo is at its torque limit
+    TEMPERATURE = 16  #: a servo is too hot
+
+
+RESPONSES = {
+    # The robot stands as before and only lacks knowledge: on stiff legs it stays upright.
+    **dict.fromkeys(
+        (Fault.HELD, Fault.READING, Fault.CLOCK, Fault.LATE, Fault.RATE, Fault.STALE), State.HOLDING
+    ),
+    **dict.fromkeys((Fault.STUCK, Fault.NETWORK), State.HOLDING),
+    # It falls or lies, or a servo works against something: stiff legs would do harm.
+    **dict.fromkeys((Fault.DAMPED, Fault.WEIGHT, Fault.LEAN, Fault.TUMBLING), State.DAMPING),
+    **dict.fromkeys((Fault.TILT, Fault.AWAY, Fault.TORQUE, Fault.TEMPERATURE), State.DAMPING),
+}
+"""Fault -> state, if the servos obey the gains; if not, every fault leads to HOLDING."""
 
 
 class _Unsafe(Exception):
-    """The reason to hold, in a sentence."""
+    """A fault, and the reason in a sentence."""
+
+    def __init__(self, fault: Fault, reason: str) -> None:
+        super().__init__(reason)
+        self.fault = fault
 
 
 class Controller:
@@ -95,25 +160,51 @@ class Controller:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], clock: Callable[[], float] = time.monotonic
+        self,
+        path: str | os.PathLike[str],
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        gains: bool = False,
+        sample_rate: float | None = None,
+        max_torque: Any = None,
+        max_temperature: float = math.inf,
     ) -> None:
-        """Reads a policy file; the state is then STANDING.
+        """Reads a policy file; the state is then STANDING, or with `gains` PASSIVE.
 
         Args:
           path: of the policy file.
           clock: returns the current time, s; in simulation, pass the simulation's.
+          gains: whether the servos obey `stiffness`, `damping` and `torque`. If not, the targets
+            are all that moves the robot, and every fault leads to HOLDING.
+          sample_rate: rate at which `step` is called, Hz; None: that of training. It must be a
+            whole multiple of that. The IMU's samples are then averaged, so that vibrations above
+            half the rate of training do not look like slow motions; of the joints the last count.
+          max_torque: greatest mean torque of a joint over a decision, N m, one or (legs, 3); None:
+            `TORQUE_SHARE` of the robot's own limits.
+          max_temperature: greatest mean temperature of a servo over a decision, deg C.
 
         Raises:
-          PolicyFileError: if the file is missing, damaged, or not a policy that this file can run.
+          PolicyFileError: if the file is missing, damaged, or not a policy that this file can run,
+            or with `gains`, if it does not say the robot's gains.
+          ValueError: for a sample rate that is no such multiple.
         """
         try:
-            self.manifest, weights = _read(Path(path))
+            content = _content(Path(path))
+            self.manifest, weights = _read(content)
             self._set_up(self.manifest, weights)
+            if gains and self._gains is None:
+                raise PolicyFileError("it does not say the stiffness and damping of its servos")
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             name = _line(path, MOST_PATH)
             message = _line(f"{name} cannot be used: {_reason(error)}", MOST_MESSAGE)
             raise PolicyFileError(message) from error
-        self._clock = clock
+        self._clock, self._obeyed = clock, gains
+        self._per_sample = self._calls_per_sample(sample_rate)
+        if max_torque is not None:
+            self._most_loads[0] = np.broadcast_to(max_torque, (len(self.joints), 3)).ravel()
+        self._most_loads[1] = max_temperature
+        size = min(math.ceil(LOG_S / self.sample_dt), MOST_LOG)
+        self._log = _Log(size, len(self.joints), content)
         self.reset()
 
     def _set_up(self, manifest: dict[str, Any], weights: dict[str, np.ndarray]) -> None:
@@ -163,43 +254,143 @@ class Controller:
         most = np.repeat((GYRO_MOST, ACCEL_MOST), 3)
         self._least, self._most = np.append(low, -most), np.append(high, most)
         self._reading = np.zeros_like(self._most)
+        self._set_up_servos(manifest)
+
+    def _set_up_servos(self, manifest: dict[str, Any]) -> None:
+        """Reads gains, trim and torque limits; files may lack them."""
+        robot, shape = manifest["robot"], (len(self.joints), 3)
+        self._gains: np.ndarray | None = None
+        self._trim: np.ndarray | None = None
+        gains = [robot.get(name) for name in ("servo_stiffness", "servo_damping")]
+        if None not in gains:
+            gains = [np.broadcast_to(np.asarray(gain, float), shape) for gain in gains]
+            self._gains = _numbers("servo_stiffness and servo_damping", gains, (2, *shape))
+            if not (self._gains >= 0).all():
+                raise PolicyFileError("its servos have gains below 0")
+        if manifest.get("leg_trim_rad") is not None:
+            self._trim = _numbers("leg_trim_rad", manifest["leg_trim_rad"], shape)
+            if not (abs(self._trim) <= TRIM_MOST).all():
+                raise PolicyFileError(f"its leg_trim_rad goes beyond {TRIM_MOST:g} rad")
+        torques = [robot.get(name) or math.inf for name in ("hip_torque", "knee_torque")]
+        most = TORQUE_SHARE * np.asarray([torques[0], torques[0], torques[1]], float)
+        self._most_loads = np.stack((np.tile(most, shape[0]), np.full(math.prod(shape), math.inf)))
+
+    def _calls_per_sample(self, rate: float | None) -> int:
+        if rate is None:
+            return 1
+        calls = rate * self.sample_dt
+        if not 1 <= round(calls, 6) <= MOST_CALLS or abs(calls - round(calls)) > 1e-6 * calls:
+            raise ValueError(
+                f"sample_rate is {rate:g} Hz; it must be a whole multiple of the policy's "
+                f"{1 / self.sample_dt:g} Hz, at most {MOST_CALLS} times that"
+            )
+        return round(calls)
 
     @property
     def targets(self) -> np.ndarray:
         """(legs, 3) joint targets, rad, as `step` returned last; at first the standing pose."""
         return self._targets.copy()
 
+    @property
+    def stiffness(self) -> np.ndarray | None:
+        """(legs, 3) position gains of the servos, N m / rad; None if the file does not say them."""
+        return None if self._gains is None else self._stiff * self._gains[0]
+
+    @property
+    def damping(self) -> np.ndarray | None:
+        """(legs, 3) damping of the servos, N m s / rad; None if the file does not say it."""
+        return None if self._gains is None else float(self._damped) * self._gains[1]
+
+    @property
+    def torque(self) -> np.ndarray | None:
+        """(legs, 3) feed-forward torque, N m, which bears the standing robot's weight.
+
+        It replaces the trim of the targets. None if the file does not say the trim.
+        """
+        if self._gains is None or self._trim is None:
+            return None
+        return self._loaded * self._gains[0] * self._trim
+
     def reset(self) -> None:
-        """Starts again; the robot must stand still at its standing height."""
-        self.state = State.STANDING
-        self.reason = ""  #: the reason for holding, in a sentence
+        """Starts again, STANDING, or PASSIVE if the servos obey the gains.
+
+        A robot that is then STANDING must stand still at its standing height.
+        """
+        self.state = State.PASSIVE if self._obeyed else State.STANDING
+        self.fault = Fault.NONE  #: why it is HOLDING or DAMPING
+        self.reason = ""  #: the same in a sentence
         self.action: int | None = None  #: index of the last action, or of the nearest on the grid
         self.command: np.ndarray | None = None  #: its height changes a_x and a_y, m
         self._commands[:] = self._height
         self._path = self._legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]
-        self._since = self._seen = self._gaps = 0
+        self._since = self._seen = self._gaps = self._risen = 0
         self._called = self._decided = math.nan
+        self._way: _Way | None = None
+        # Shares of stiffness and feed-forward torque, and whether the servos damp.
+        self._stiff = self._loaded = 0.0 if self._obeyed else 1.0
+        self._damped = not self._obeyed
+        self._begin_sample()
+        self._loads, self._load_counts = np.zeros_like(self._most_loads), [0, 0]
+
+    def stand(self) -> None:
+        """Stands up from the pose of the next sample, then balances; only PASSIVE or STANDING.
+
+        In `GAIN_RISE_S` the stiffness comes up. Then the feet come under the hips, and the legs
+        lift the trunk to its standing height. Balancing begins when the robot is still: no gyro
+        reading of a decision's samples is above `STILL_RATE`.
+        """
+        if self.state in (State.PASSIVE, State.STANDING):
+            self.state, self.reason, self._damped = State.STANDING_UP, "", True
 
     def hold(self, reason: str) -> None:
-        """Holds the targets until `reset`; does nothing if the controller already holds."""
-        if self.state is not State.HOLDING:
-            self.state, self.reason = State.HOLDING, _line(reason, MOST_MESSAGE)
+        """Holds targets and gains until `reset`; does nothing if it already holds or damps."""
+        self._stop(Fault.HELD, reason)
+
+    def damp(self, reason: str) -> None:
+        """Damps the legs without stiffness until `reset`; without `gains`, holds."""
+        self._stop(Fault.DAMPED, reason)
+
+    def save_log(self, path: str | os.PathLike[str]) -> None:
+        """Writes the last 60 s to a file, as .npz; `mjx-balance replay` reads it.
+
+        It ends with the sample that led to HOLDING or DAMPING, and holds the policy file.
+
+        Raises:
+          OSError: if it cannot be written; an old file then stays.
+        """
+        file = Path(path)
+        part = file.with_name(file.name + ".part")
+        with part.open("wb") as stream:
+            np.savez_compressed(stream, reason=np.asarray(self.reason), **self._log.arrays())
+        part.replace(file)
 
     def step(
-        self, joint_positions: np.ndarray, gyro: np.ndarray, accelerometer: np.ndarray
+        self,
+        joint_positions: np.ndarray,
+        gyro: np.ndarray,
+        accelerometer: np.ndarray,
+        *,
+        quaternion: np.ndarray | None = None,
+        torques: np.ndarray | None = None,
+        temperatures: np.ndarray | None = None,
     ) -> np.ndarray:
         """Processes a sample of the sensors; returns the joint targets until the next sample.
 
         It holds if a reading is not a number in a sensor's range, if a call comes too late, or if
         the sample rate is not that of training. At a decision it also holds if too many of the
         IMU's samples are repeated, if lean, angular rate or weight are not those of a balancing
-        robot, or if a joint is far from its target.
+        robot, or if a joint is far from its target. If the servos obey the gains, some of these
+        lead to DAMPING (`RESPONSES`).
 
         Args:
           joint_positions: (legs, 3) abduction, hip and knee angles, rad, in the order of `joints`.
           gyro: (3,) rad/s; x forward, y left, z up.
           accelerometer: (3,) m/s^2, same axes; about (0, 0, 9.81) at rest.
+          quaternion: (4,) orientation of the trunk in the world, w first, if the IMU gives it. Only
+            to notice a fall at once, whatever pushes do to the accelerometer.
+          torques: (legs, 3) measured torques of the servos, N m.
+          temperatures: (legs, 3) of the servos, deg C.
 
         Returns:
           (legs, 3) joint position targets, rad.
@@ -207,65 +398,182 @@ class Controller:
         Raises:
           ValueError: if an array of the first sample has another shape; later ones make it hold.
         """
+        ended = self.state in (State.HOLDING, State.DAMPING)
         try:
             self._read_sensors(joint_positions, gyro, accelerometer)
-            if self.state is not State.HOLDING:
-                self._advance(self._time())
+            if self.state is State.PASSIVE:
+                self._check_reading()
+                self._targets = self._reading[:-IMU].reshape(-1, 3).copy()
+                self.reason = ""
+            elif not ended:
+                self._take(self._time(), quaternion, torques, temperatures)
+            elif self._obeyed:
+                self._watch(quaternion)
         except _Unsafe as unsafe:
-            self.hold(str(unsafe))
+            if self.state is State.PASSIVE:
+                self.reason = _line(unsafe, MOST_MESSAGE)
+            else:
+                self._stop(unsafe.fault, str(unsafe))
+        if self.fault is not Fault.NONE and not ended:
+            self._record(start=False)
         return self._targets.copy()
+
+    def _stop(self, fault: Fault, reason: str) -> None:
+        """Holds or damps; who holds may still damp."""
+        response = RESPONSES[fault] if self._obeyed else State.HOLDING
+        if self.state not in (response, State.DAMPING):
+            self.state, self.fault, self.reason = response, fault, _line(reason, MOST_MESSAGE)
+            if response is State.DAMPING:
+                self._stiff, self._loaded, self._damped = 0.0, 0.0, True
+            self._begin_sample()
 
     def _read_sensors(self, *arguments: np.ndarray) -> None:
         """Checks shapes, and copies all readings to `_reading`: joints, gyro, accelerometer."""
         joints, gyro, accel = map(_numeric, ARGUMENTS, arguments)
         if joints.shape != self._targets.shape or gyro.shape != (3,) or accel.shape != (3,):
             shapes = [_line(x.shape, 40) for x in (joints, gyro, accel)]
-            kind = ValueError if self.state is State.STANDING else _Unsafe
-            raise kind(
+            sentence = (
                 f"joint_positions, gyro and accelerometer have shapes {shapes[0]}, {shapes[1]} "
                 f"and {shapes[2]}; they must be {self._targets.shape}, (3,) and (3,)"
             )
+            if self.state is State.STANDING:
+                raise ValueError(sentence)
+            raise _Unsafe(Fault.READING, sentence)
         np.concatenate((joints.ravel(), gyro, accel), out=self._reading)
 
     def _time(self) -> float:
         try:
             return float(self._clock())
         except Exception as error:  # whatever a clock raises, the legs stay where they are
-            raise _Unsafe(f"the clock gives no time: {error}") from error
+            raise _Unsafe(Fault.CLOCK, f"the clock gives no time: {error}") from error
+
+    def _begin_sample(self) -> None:
+        """Forgets the calls since the policy's last sample."""
+        self._calls, self._sum = 0, np.zeros(IMU)
+
+    def _take(self, now: float, quaternion: Any, torques: Any, temperatures: Any) -> None:
+        """Checks a call's readings; every `_per_sample` calls are a sample of the policy."""
+        last, self._called = self._called, now
+        self._check_reading()
+        if quaternion is not None:
+            self._check_tilt(quaternion)
+        first = self._way is None and self.state is not State.BALANCING
+        if not first:
+            self._check_time(now - last)
+        self._add_load(0, torques)
+        self._add_load(1, temperatures)
+        self._sum += self._reading[-IMU:]
+        self._calls += 1
+        if first or self._calls == self._per_sample:
+            self._reading[-IMU:] = self._sum / self._calls
+            self._begin_sample()
+            balanced = self.state is State.BALANCING
+            self._advance(now)
+            self._record(self.state is State.BALANCING and not balanced)
 
     def _advance(self, now: float) -> None:
-        """Checks the sample, decides if a decision is due, and updates the targets."""
-        self._check_reading()
-        self._seen += 1
+        """Takes a sample; checks and decides if that is due, and updates the targets."""
+        imu = self._reading[-IMU:]
         if self.state is State.STANDING:
-            self._imu[:] = self._reading[-IMU:]
-            self._inputs.means.start(self._reading[-IMU:])
-            self._poses.clear()
-            self._poses.append(self._reading[:-IMU].copy())
-            self._there = self._targets.ravel()
+            self._fill(imu)
             self._check_posture()
-            self.state = State.BALANCING
-            self._decide(now)
+            self._begin(now)
+        elif self.state is State.STANDING_UP and self._way is None:
+            self._fill(imu)
+            self._way = self._plan_way()
+            self._there, self._decided = self._reading[:-IMU].copy(), now
+            self._targets = self._way.at(0)[0]
+            self._check_posture()
         else:
-            self._check_time(now)
-            self._imu[self._history + self._since] = self._reading[-IMU:]
-            self._inputs.means.add(self._reading[-IMU:])
+            self._seen += 1
+            self._imu[self._history + self._since] = imu
+            self._inputs.means.add(imu)
             self._since += 1
             if self._since == self.decision_samples:
-                self._check_rate(now)
-                self._check_liveness()
-                self._check_posture()
-                self._decide(now)
-        self._called = now
-        self._targets = self._path[min(self._since, len(self._path) - 1)]
+                self._end_decision(now)
+        if self.state is State.BALANCING:
+            self._targets = self._path[min(self._since, len(self._path) - 1)]
+        elif self._way is not None:
+            self._targets, stiff, self._loaded = self._way.at(self._risen)
+            self._stiff = stiff if self._obeyed else 1.0
+            self._risen += 1
+
+    def _fill(self, imu: np.ndarray) -> None:
+        """Fills the histories with a sample (6,) of a robot that is still."""
+        self._imu[:] = imu
+        self._inputs.means.start(imu)
+        self._poses.clear()
+        self._poses.append(self._reading[:-IMU].copy())
+        self._there = self._targets.ravel()
+        self._seen, self._gaps = 1, 0
+
+    def _begin(self, now: float) -> None:
+        """Begins to balance; the histories are filled."""
+        self.state = State.BALANCING
+        self._decide(now)
+
+    def _end_decision(self, now: float) -> None:
+        """Checks the samples since the last decision, and takes the next one."""
+        self._check_rate(now)
+        self._check_liveness()
+        self._check_posture()
+        self._check_loads()
+        if self.state is State.BALANCING:
+            self._decide(now)
+            return
+        samples = self._imu[self._history :]
+        done = self._way is not None and self._risen > self._way.samples + self.decision_samples
+        if done and (abs(samples[:, :3]) <= STILL_RATE).all():
+            self._way = None
+            self._reading[-IMU:] = samples.mean(axis=0)
+            self._fill(self._reading[-IMU:])
+            self._begin(now)
+        else:
+            self._next_decision(now)
+
+    def _next_decision(self, now: float) -> None:
+        self._imu[: self._history] = self._imu[-self._history :]
+        self._since, self._decided = 0, now
+
+    def _plan_way(self) -> _Way:
+        """Plans to stand up: the feet come under the hips, then the legs become longer."""
+        pose, low = self._reading[:-IMU].reshape(-1, 3).copy(), self._legs.height_range[0]
+        height = min(max(float(self._legs.foot_heights(pose).min()), low), self._height)
+        crouch = self._legs.joint_angles(np.full(len(pose), height))
+        return _Way(pose, crouch, self._path[0], self.sample_dt)
+
+    def _watch(self, quaternion: Any) -> None:
+        """Checks that a robot that is HOLDING has not fallen."""
+        self._check_reading()
+        if quaternion is not None:
+            self._check_tilt(quaternion)
+        self._sum += self._reading[-IMU:]
+        self._calls += 1
+        if self._calls == self.decision_samples * self._per_sample:
+            accel = (self._sum[3:] / self._calls).tolist()
+            self._begin_sample()
+            self._check_lean(accel)
+
+    def _record(self, start: bool) -> None:
+        """Logs the sample; `start`: it is the first of a balancing robot."""
+        reading, none = self._reading, self.command is None
+        self._log.add(
+            (
+                *(self._called, reading[:-IMU].reshape(-1, 3), reading[-IMU:-3], reading[-3:]),
+                *(self._targets, math.nan if none else self.command, -1 if none else self.action),
+                *(_CODES[self.state], self.fault),
+                *(self.state is State.BALANCING and self._since == 0, start),
+            )
+        )
 
     def _check_reading(self) -> None:
         sane = (self._least <= self._reading) & (self._reading <= self._most)  # NaN is not
         k = int(sane.argmin())
         if not sane[k]:
             raise _Unsafe(
+                Fault.READING,
                 f"{self._name(k)} reads {self._reading[k]:.3g}, which is not between "
-                f"{self._least[k]:.3g} and {self._most[k]:.3g}"
+                f"{self._least[k]:.3g} and {self._most[k]:.3g}",
             )
 
     def _name(self, k: int) -> str:
@@ -274,12 +582,13 @@ class Controller:
         names += [f"{sensor} {axis}" for sensor in SENSORS for axis in "xyz"]
         return names[k]
 
-    def _check_time(self, now: float) -> None:
+    def _check_time(self, gap: float) -> None:
         most = LATE_SAMPLES * self.sample_dt
-        if not 0 <= now - self._called <= most:
+        if not 0 <= gap <= most:
             raise _Unsafe(
-                f"a sample came {now - self._called:.3g} s after the one before it; it must come "
-                f"within {most:.3g} s"
+                Fault.LATE,
+                f"a sample came {gap:.3g} s after the one before it; it must come within "
+                f"{most:.3g} s",
             )
 
     def _check_rate(self, now: float) -> None:
@@ -287,8 +596,9 @@ class Controller:
         took, most = now - self._decided, LATE_SAMPLES * self.sample_dt
         if abs(took - self._decision_dt) > most:
             raise _Unsafe(
+                Fault.RATE,
                 f"{self.decision_samples} samples took {took:.3g} s; they must take "
-                f"{self._decision_dt:.3g} s within {most:.3g}, as in training"
+                f"{self._decision_dt:.3g} s within {most:.3g}, as in training",
             )
 
     def _check_liveness(self) -> None:
@@ -309,8 +619,9 @@ class Controller:
         k = int(moved.argmax())
         if moved[k] > STUCK_MOST:
             raise _Unsafe(
+                Fault.STUCK,
                 f"{self._name(k)} reads {joints[k]:.3g} all the time, while its target moved by "
-                f"{moved[k]:.2g} rad"
+                f"{moved[k]:.2g} rad",
             )
 
     def _check_latest(self, new: np.ndarray) -> None:
@@ -321,8 +632,9 @@ class Controller:
         self._gaps = self._gaps + 1 if gap else 0
         if self._gaps == 2:
             raise _Unsafe(
+                Fault.STALE,
                 f"the IMU repeats itself: at two decisions, one after the other, {latest} of its "
-                f"last {count} samples are new; at least {least} must be"
+                f"last {count} samples are new; at least {least} must be",
             )
 
     def _check_new(self, name: str, new: int, count: int, share: float) -> None:
@@ -330,8 +642,9 @@ class Controller:
         least = max(2, round(share * self._recent))
         if new < least and self._seen >= count:
             raise _Unsafe(
+                Fault.STALE,
                 f"the {name} repeats itself: {new} of its last {count} samples are new; at least "
-                f"{least} must be"
+                f"{least} must be",
             )
 
     def _check_posture(self) -> None:
@@ -340,26 +653,82 @@ class Controller:
         weight, rate = math.hypot(*accel), math.hypot(x, y)
         if not WEIGHT[0] <= weight <= WEIGHT[1]:
             raise _Unsafe(
+                Fault.WEIGHT,
                 f"the accelerometer gives {weight:.3g} m/s^2 in the mean of a decision; it must be "
-                f"{WEIGHT[0]:.3g} to {WEIGHT[1]:.3g}, and 9.81 at rest"
+                f"{WEIGHT[0]:.3g} to {WEIGHT[1]:.3g}, and 9.81 at rest",
             )
-        lean = math.degrees(math.acos(min(max(accel[2] / weight, -1.0), 1.0)))
-        if lean > LEAN_MOST:
+        self._check_lean(accel)
+        # Who stands up may tip from its side onto its feet.
+        if rate > self._rate_most and self.state is not State.STANDING_UP:
             raise _Unsafe(
-                f"the accelerometer leans by {lean:.3g} deg in the mean of a decision, more than "
-                f"{LEAN_MOST:g}: the robot has fallen, or up is not its z"
-            )
-        if rate > self._rate_most:
-            raise _Unsafe(
+                Fault.TUMBLING,
                 f"the gyro gives {rate:.3g} rad/s about x and y in the mean of a decision, more "
-                f"than {self._rate_most:.3g}: the robot falls, or these are no rad/s"
+                f"than {self._rate_most:.3g}: the robot falls, or these are no rad/s",
             )
         errors = np.abs(self._reading[:-IMU] - self._targets.ravel())
         k = int(errors.argmax())
         if errors[k] > AWAY_MOST:
             raise _Unsafe(
-                f"{self._name(k)} is {errors[k]:.3g} rad from its target, more than {AWAY_MOST:g}"
+                Fault.AWAY,
+                f"{self._name(k)} is {errors[k]:.3g} rad from its target, more than {AWAY_MOST:g}",
             )
+
+    def _check_lean(self, accel: list[float]) -> None:
+        """Checks a mean acceleration, m/s^2, for a robot that lies."""
+        weight = math.hypot(*accel)
+        lean = math.degrees(math.acos(min(max(accel[2] / max(weight, 1e-9), -1.0), 1.0)))
+        if lean > LEAN_MOST:
+            raise _Unsafe(
+                Fault.LEAN,
+                f"the accelerometer leans by {lean:.3g} deg in the mean of a decision, more than "
+                f"{LEAN_MOST:g}: the robot has fallen, or up is not its z",
+            )
+
+    def _check_tilt(self, quaternion: Any) -> None:
+        """Checks a quaternion for a robot that lies."""
+        values = _numeric("quaternion", quaternion)
+        norm = math.hypot(*map(float, values)) if values.shape == (4,) else math.nan
+        if not abs(norm - 1) <= NORM_ERROR:
+            raise _Unsafe(
+                Fault.READING, f"quaternion is {_line(values, 80)}, not four numbers of norm 1"
+            )
+        _, x, y, _ = map(float, values)
+        tilt = math.degrees(math.acos(max(1 - 2 * (x * x + y * y) / norm**2, -1.0)))
+        if tilt > TILT_MOST:
+            raise _Unsafe(
+                Fault.TILT,
+                f"the quaternion is tilted by {tilt:.3g} deg, more than {TILT_MOST:g}: the robot "
+                "has fallen, or up is not its z",
+            )
+
+    def _add_load(self, kind: int, values: Any) -> None:
+        """Adds torques (kind 0) or temperatures (1) of the servos, if given."""
+        if values is None:
+            return
+        array = _numeric(LOADS[kind], values)
+        if array.shape != self._targets.shape:
+            raise _Unsafe(
+                Fault.READING,
+                f"{LOADS[kind]} has shape {_line(array.shape, 40)}; it must be "
+                f"{self._targets.shape}",
+            )
+        self._loads[kind] += abs(array.ravel())
+        self._load_counts[kind] += 1
+
+    def _check_loads(self) -> None:
+        """Checks mean torques and temperatures of a decision's samples."""
+        counts = np.maximum(self._load_counts, 1)[:, None]
+        means, faults = self._loads / counts, (Fault.TORQUE, Fault.TEMPERATURE)
+        self._loads, self._load_counts = np.zeros_like(self._loads), [0, 0]
+        for mean, most, name, unit, fault in zip(means, self._most_loads, LOADS, UNITS, faults):
+            sane = mean <= most  # NaN is not
+            k = int(sane.argmin())
+            if not sane[k]:
+                raise _Unsafe(
+                    fault,
+                    f"{name} of {self._name(k)} are {mean[k]:.3g} {unit} in the mean of a "
+                    f"decision, more than {most[k]:.3g}",
+                )
 
     def _decide(self, now: float) -> None:
         """Chooses an action, and computes its ramp of targets, `_path`."""
@@ -372,8 +741,8 @@ class Controller:
         self._commands[:-1] = self._commands[1:]
         self._commands[-1] = after
         self._path = self._legs.joint_angles(before * (1 - self._share) + after * self._share)
-        self._imu[: self._history] = self._imu[-self._history :]
-        self._since, self._decided, self.command = 0, now, command
+        self.command = command
+        self._next_decision(now)
 
     def _observation(self) -> np.ndarray:
         return self._inputs.observe(
@@ -384,6 +753,63 @@ class Controller:
                 "accelerometer": self._imu[:, 3:],
             }
         )
+
+
+class _Way:
+    """Way of the targets from a pose (legs, 3) over a crouch to another one, rad.
+
+    It stays at the first pose while the stiffness comes up. The share of the way to the next pose
+    is x^3 (10 - 15 x + 6 x^2) at the share x of its time: without speed and acceleration at both
+    ends.
+    """
+
+    def __init__(self, pose: np.ndarray, crouch: np.ndarray, end: np.ndarray, dt: float) -> None:
+        self._pose, self._fold, self._lift = pose, crouch - pose, end - crouch
+        self._counts = [max(1, round(GAIN_RISE_S / dt))]
+        for change in (self._fold, self._lift):
+            seconds = max(STEEPEST * float(abs(change).max()) / STAND_SPEED, LEAST_MOVE_S)
+            self._counts.append(max(1, math.ceil(seconds / dt)))
+        self.samples = sum(self._counts)  #: until it ends
+
+    def at(self, k: int) -> tuple[np.ndarray, float, float]:
+        """Targets (legs, 3), rad, and the shares of stiffness and torque after `k` samples."""
+        shares = []
+        for count in self._counts:
+            shares.append(min(max(k, 0) / count, 1.0))
+            k -= count
+        fold, lift = (x**3 * (10 - 15 * x + 6 * x * x) for x in shares[1:])
+        return self._pose + fold * self._fold + lift * self._lift, shares[0], lift
+
+
+class _Log:
+    """The last samples, in a ring."""
+
+    def __init__(self, size: int, legs: int, policy: bytes) -> None:
+        joints, real = ("f8", (legs, 3)), ("f8", (3,))
+        kinds = [("time", "f8"), ("joint_positions", *joints), ("gyro", *real)]
+        kinds += [("accelerometer", *real), ("targets", *joints), ("command", "f8", (2,))]
+        kinds += [("action", "i4"), ("state", "u1"), ("fault", "u1")]
+        kinds += [("decision", "?"), ("start", "?")]
+        self._rows, self._count = np.empty(size, kinds), 0
+        self._kinds, self._policy = kinds, policy
+
+    def add(self, row: tuple[Any, ...]) -> None:
+        """Adds a sample: values in the order of the kinds."""
+        self._rows[self._count % len(self._rows)] = row
+        self._count += 1
+
+    def arrays(self) -> dict[str, Any]:
+        """All samples by name, the oldest first, with what explains them."""
+        rows = np.roll(self._rows, -self._count) if self._count > len(self._rows) else self._rows
+        rows = rows[: self._count]
+        return {
+            "version": np.asarray(LOG_VERSION),
+            "policy": np.frombuffer(self._policy, np.uint8),
+            **{name: rows[name] for name, *_ in self._kinds},
+        }
+
+
+_CODES = {state: code for code, state in enumerate(State)}  # in the log
 
 
 class _Inputs:
@@ -585,7 +1011,7 @@ class _Network:
             kernel, bias = self._layers[-1]
             out = (np.concatenate((x, obs)) if self.radial else x) @ kernel + bias
         if not np.isfinite(out).all():
-            raise _Unsafe("the network gives values that are not finite numbers")
+            raise _Unsafe(Fault.NETWORK, "the network gives values that are not finite numbers")
         index = 0
         for k, levels in enumerate(self.factors):
             index = index * levels + (self._nearest(out, k) if self.radial else self._best(out, k))
@@ -602,9 +1028,8 @@ class _Network:
         return int(np.argmax(out[start : start + self.factors[axis]]))
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _read(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Reads manifest and weights of a safetensors file: size of the header, header, numbers."""
-    content = _content(path)
     try:
         size = int.from_bytes(content[:8], "little")
         if size > len(content) - 8:
@@ -681,7 +1106,9 @@ def _numeric(name: str, values: Any) -> np.ndarray:
             return array
     except Exception:
         pass
-    raise _Unsafe(f"{name} is a value of type {type(values).__name__}; it must be numbers")
+    raise _Unsafe(
+        Fault.READING, f"{name} is a value of type {type(values).__name__}; it must be numbers"
+    )
 
 
 def _number(name: str, value: Any, least: float, most: float) -> float:

@@ -14,6 +14,7 @@ COMMANDS = {
     "evaluate": "evaluate:evaluate",
     "report": "report:report",
     "export": "export:export",
+    "replay": "replay:replay",
     "view": "view:view",
     "robot": "robot:robot",
 }

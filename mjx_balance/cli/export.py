@@ -4,12 +4,15 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
 from mjx_balance.cli.common import complain
 from mjx_balance.errors import PATH, how_to_install, shorten
-from mjx_balance.policy.file import convert_policy, find_policy, load_policy
-from mjx_balance.policy.manifest import FORMAT_VERSION
+from mjx_balance.evaluation.rollout import policy_scene
+from mjx_balance.policy.file import convert_policy, find_policy, load_policy, read_policy
+from mjx_balance.policy.manifest import FORMAT_VERSION, naming, upgrade
+from mjx_balance.policy.network import Policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +26,9 @@ class ExportArgs:
     action: Literal["grid", "continuous"] | None = None
     """Command height changes of the grid, or any up to its greatest; none: as the policy was
     trained."""
+    trim: bool = False
+    """Measure in simulation how far the servos must aim beyond their targets to bear the robot, so
+    that a runtime knows feed-forward torques; a trained policy has that already."""
 
 
 def export(argv: list[str]) -> int:
@@ -51,7 +57,15 @@ def _write_onnx(args: ExportArgs) -> int:
 
 
 def _write_safetensors(args: ExportArgs) -> int:
-    policy = convert_policy(find_policy(args.policy), args.out, args.action)
+    path = find_policy(args.policy)
+    policy = convert_policy(path, args.out, args.action, _leg_trim(path) if args.trim else None)
     size, file = args.out.stat().st_size, shorten(args.out, PATH)
     print(f"{file}: {size / 1000:,.1f} kB, format {FORMAT_VERSION}, weights {policy.fingerprint}")
     return 0
+
+
+def _leg_trim(path: Path) -> np.ndarray:
+    """(legs, 3) trim of the scene of a policy of format 4 or 5, rad."""
+    manifest, weights = read_policy(path)
+    with naming(path):
+        return policy_scene(Policy(upgrade(manifest), weights)).stance.leg_trim

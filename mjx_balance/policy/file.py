@@ -50,13 +50,16 @@ def save_policy(
     return policy
 
 
-def convert_policy(path: Path, out: Path, action: str | None = None) -> Policy:
+def convert_policy(
+    path: Path, out: Path, action: str | None = None, leg_trim: np.ndarray | None = None
+) -> Policy:
     """Writes a policy file of format 4 or 5 in format 5, atomically, with the same weights.
 
     Args:
       path: file to read.
       out: file to write; may be the same.
       action: `config.task.action` of the new file; None: as before.
+      leg_trim: (legs, 3) trim for the new file, rad; None: as before.
 
     Raises:
       PolicyError: if `path` is not a policy of these formats, or its head allows no such action.
@@ -67,6 +70,8 @@ def convert_policy(path: Path, out: Path, action: str | None = None) -> Policy:
         manifest = upgrade(manifest)
         if action is not None:
             manifest = Policy(manifest, weights).with_action(action).manifest
+        if leg_trim is not None:
+            manifest = manifest | {"leg_trim_rad": leg_trim.tolist()}
         return save_policy(out, weights, manifest)
 
 

@@ -9,13 +9,17 @@ import importlib.metadata
 import json
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Ge, Le, Len
 
 from mjx_balance.config import ACTION_AXES, Config, check, from_dict, to_dict
 from mjx_balance.errors import InputError, quote
 from mjx_balance.files.validation import parse
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import check_body, check_robot
+from mjx_balance.runtime import TRIM_MOST
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.observation import Row, input_rows
 
@@ -25,6 +29,10 @@ MOST_PART = 2**18  #: greatest size of config, robot, versions and training, cha
 REMEDY = "; `mjx-balance export OLD.safetensors --out NEW.safetensors` converts a file of version 4"
 VERSIONED = ("mjx_balance", "mujoco", "mujoco-mjx", "jax", "flax", "numpy")
 """Packages whose versions a manifest records."""
+
+
+Trim = Annotated[float, Ge(-TRIM_MOST), Le(TRIM_MOST)]  #: rad
+TRIMS: Any = Annotated[list[Annotated[list[Trim], Len(3, 3)]], Len(4, 4)]
 
 
 class PolicyError(InputError):
@@ -40,14 +48,22 @@ def naming(subject: object) -> Iterator[None]:
         raise PolicyError(f"{subject} cannot be used: {error}") from error
 
 
-def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) -> dict[str, Any]:
+def make_manifest(
+    config: Config,
+    scene_hash: str,
+    training: Mapping[str, Any],
+    leg_trim: np.ndarray | None = None,
+) -> dict[str, Any]:
     """Returns the manifest of a policy, as JSON values.
 
     Args:
       config: of the training.
       scene_hash: fingerprint of the training's scene.
       training: provenance, e.g. decisions and seconds.
+      leg_trim: (legs, 3) `Stance.leg_trim` of the scene, rad; without it, a runtime knows no
+        feed-forward torque.
     """
+    trim = {} if leg_trim is None else {"leg_trim_rad": leg_trim.tolist()}
     return {
         "format": FORMAT,
         "version": FORMAT_VERSION,
@@ -56,6 +72,7 @@ def make_manifest(config: Config, scene_hash: str, training: Mapping[str, Any]) 
         "scene_hash": scene_hash,
         "versions": {package: installed_version(package) for package in VERSIONED},
         "training": dict(training),
+        **trim,
     }
 
 
@@ -109,6 +126,8 @@ def read_manifest(manifest: Any) -> tuple[Config, Robot]:
             remedy = REMEDY if value == CONVERTIBLE else ""
             raise PolicyError(f"{name} is {quote(value)}; this release reads {expected!r}{remedy}")
     config, robot = _config_and_robot(manifest)
+    if "leg_trim_rad" in manifest:
+        parse(TRIMS, manifest["leg_trim_rad"], PolicyError, name="leg_trim_rad")
     # The first files of format 5 do not say what kind of action they have, nor a command delay.
     given = {"action": "grid"} | manifest | {"robot": to_dict(robot)}
     for part, expected in describe(config, robot).items():

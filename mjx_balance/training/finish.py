@@ -51,7 +51,7 @@ def export(run: Run, state: TrainState, seconds: float) -> list[Policy]:
       PolicyError: if no seed has a policy.
     """
     policies = []
-    for weights, manifest in exports(run.config, run.learner, run.env.scene.hash, state):
+    for weights, manifest in exports(run.config, run.learner, run.env.scene, state):
         manifest["training"]["seconds_learning_since_start_or_resume"] = round(seconds, 1)
         try:
             policies.append(_export(run, weights, manifest))

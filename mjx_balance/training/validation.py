@@ -17,6 +17,7 @@ from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.policy.file import flat_weights, load_policy, save_policy
 from mjx_balance.policy.manifest import PolicyError, make_manifest
 from mjx_balance.policy.network import Policy
+from mjx_balance.sim.scene import Scene
 from mjx_balance.training.loop import Run, number
 
 Results = dict[str, dict[str, Any]]  #: suite name -> JSON of `rollout.summarize`
@@ -38,9 +39,9 @@ def scalars(results: Results) -> dict[str, float]:
 
 
 def exports(
-    config: Config, learner: DQN, scene_hash: str, state: TrainState
+    config: Config, learner: DQN, scene: Scene, state: TrainState
 ) -> Iterator[tuple[Params, dict[str, Any]]]:
-    """Weights and manifest of every seed's greedy policy, for a scene with this hash."""
+    """Weights and manifest of every seed's greedy policy, trained in this scene."""
     small = state._replace(env_state=None, replay=None)  # pyright: ignore[reportArgumentType]
     if jax.process_count() > 1:  # the others do not take part: nothing of theirs may be touched
         small = jax.tree.map(np.asarray, small)
@@ -53,7 +54,8 @@ def exports(
     runs = expand_runs(config)
     for k, own in enumerate(runs):
         mine = jax.tree.map(lambda x: x[k], small) if len(runs) > 1 else small  # noqa: B023
-        yield jax.device_get(learner.export_params(mine)), make_manifest(own, scene_hash, training)
+        manifest = make_manifest(own, scene.hash, training, scene.stance.leg_trim)
+        yield jax.device_get(learner.export_params(mine)), manifest
 
 
 def validate(run: Run, state: TrainState) -> dict[str, np.ndarray]:
@@ -64,7 +66,7 @@ def validate(run: Run, state: TrainState) -> dict[str, np.ndarray]:
     """
     rows = [
         _validate(run, weights, manifest)
-        for weights, manifest in exports(run.config, run.learner, run.env.scene.hash, state)
+        for weights, manifest in exports(run.config, run.learner, run.env.scene, state)
     ]
     names = dict.fromkeys(name for row in rows for name in row)
     return {name: np.asarray([row.get(name, np.nan) for row in rows]) for name in names}
