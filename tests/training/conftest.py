@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -152,7 +153,8 @@ def make_run(folder: RunFolder, display: Listener, stub_learner: StubLearner) ->
     """Config, scene -> a run of the stub learner."""
 
     def make(config: Config, scene: Any = None) -> Run:
-        scene = scene or types.SimpleNamespace(hash="hash")
+        stance = types.SimpleNamespace(leg_trim=np.zeros((4, 3)))
+        scene = scene or types.SimpleNamespace(hash="hash", stance=stance)
         env: Any = types.SimpleNamespace(scene=scene, metrics={})
         learner: Any = stub_learner
         return Run(config, env, learner, folder, display)
