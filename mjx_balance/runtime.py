@@ -997,7 +997,11 @@ class _Network:
                 raise PolicyFileError(f"weight {name} is missing or not of shape {shape}")
             if not np.isfinite(weights[name]).all():
                 raise PolicyFileError(f"weight {name} holds values that are not finite numbers")
-        self._layers = [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in names]
+        # Sums in float64: they are then the same in any order, also in a header in C.
+        self._layers = [
+            (weights[f"{name}/kernel"].astype(float), weights[f"{name}/bias"].astype(float))
+            for name in names
+        ]
 
     def greedy(self, observation: np.ndarray) -> tuple[int, np.ndarray]:
         """Index of the best action, and a radial head's best point in the range of its levels.
@@ -1007,9 +1011,10 @@ class _Network:
         with np.errstate(over="ignore", invalid="ignore"):
             obs = x = observation.astype(np.float32)
             for kernel, bias in self._layers[:-1]:
-                x = np.maximum(x @ kernel + bias, 0.0)
+                x = np.maximum((x @ kernel + bias).astype(np.float32), 0.0)
             kernel, bias = self._layers[-1]
-            out = (np.concatenate((x, obs)) if self.radial else x) @ kernel + bias
+            x = np.concatenate((x, obs)) if self.radial else x
+            out = (x @ kernel + bias).astype(np.float32)
         if not np.isfinite(out).all():
             raise _Unsafe(Fault.NETWORK, "the network gives values that are not finite numbers")
         index = 0

@@ -22,7 +22,7 @@ from mjx_balance.config import Config, preset
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.sim.scene import Scene, load_scene
 
-pytest_plugins = ("fixtures.bodies", "fixtures.fleet")
+pytest_plugins = ("fixtures.bodies", "fixtures.fleet", "fixtures.headers")
 
 jax.config.update("jax_num_cpu_devices", 2)
 # The suite compiles longer than it computes. XLA reads this when its first device is asked for.

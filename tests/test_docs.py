@@ -30,6 +30,7 @@ import mujoco_menagerie
 import pytest
 import yaml
 from brax.training.agents.ppo import train as ppo
+from fixtures.headers import compiler
 
 from mjx_balance import cli, config, runtime
 from mjx_balance.cli import evaluate as evaluate_command
@@ -327,6 +328,9 @@ def test_snippets_run(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
                 run_yaml(snippet.text, capsys)
             elif kind == "toml":
                 check_toml(snippet.text)
+            elif kind == "c":  # beside the header that the command before it writes
+                command = [compiler("gcc"), "-std=c99", "-fsyntax-only", "-w", "-xc", "-I.", "-"]
+                subprocess.run(command, input=snippet.text, text=True, check=True)
             elif kind == "diff":  # of a worked example: it applies to today's code
                 check = ("git", "apply", "--check", "-C1", "-")
                 subprocess.run(check, input=snippet.text, text=True, check=True, cwd=REPO)

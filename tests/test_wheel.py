@@ -38,6 +38,7 @@ def test_what_is_in_it(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     expected = {"py.typed", "runtime.py", "policies/best.safetensors", "report/page.html"}
+    expected |= {"policy/runtime.h.in"}
     expected |= {"policies/real.safetensors"}
     expected |= {f"scenes/{name}.xml" for name in ("board", "quadruped", "scene")}
     expected |= {f"robots/{name}.toml" for name in shipped()}

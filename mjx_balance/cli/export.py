@@ -1,6 +1,7 @@
 """`mjx-balance export`."""
 
 import dataclasses
+import tempfile
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,7 @@ import tyro
 from mjx_balance.cli.common import complain
 from mjx_balance.errors import PATH, how_to_install, shorten
 from mjx_balance.evaluation.rollout import policy_scene
+from mjx_balance.policy.c_header import export_header
 from mjx_balance.policy.file import convert_policy, find_policy, load_policy, read_policy
 from mjx_balance.policy.manifest import FORMAT_VERSION, naming, upgrade
 from mjx_balance.policy.network import Policy
@@ -17,12 +19,12 @@ from mjx_balance.policy.network import Policy
 
 @dataclasses.dataclass(frozen=True)
 class ExportArgs:
-    """Write the same weights as an ONNX model (needs the package onnx), or in today's format."""
+    """Write a policy as an ONNX model (extra onnx), as a controller in C, or in today's format."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Policy file, run folder, or the name of a shipped policy."""
     out: Path
-    """File to write: NAME.onnx, or NAME.safetensors in the current format."""
+    """File to write: NAME.onnx, NAME.h, or NAME.safetensors in the current format."""
     action: Literal["grid", "continuous"] | None = None
     """Command height changes of the grid, or any up to its greatest; none: as the policy was
     trained."""
@@ -33,9 +35,9 @@ class ExportArgs:
 
 def export(argv: list[str]) -> int:
     args = tyro.cli(ExportArgs, args=argv, prog="mjx-balance export")
-    writers = {".onnx": _write_onnx, ".safetensors": _write_safetensors}
+    writers = {".onnx": _write_onnx, ".h": _write_header, ".safetensors": _write_safetensors}
     if args.out.suffix not in writers:
-        return complain(f"out is {args.out}; its name must end in {' or '.join(writers)}")
+        return complain(f"out is {args.out}; its name must end in {', '.join(writers)}")
     return writers[args.out.suffix](args)
 
 
@@ -57,11 +59,24 @@ def _write_onnx(args: ExportArgs) -> int:
 
 
 def _write_safetensors(args: ExportArgs) -> int:
-    path = find_policy(args.policy)
-    policy = convert_policy(path, args.out, args.action, _leg_trim(path) if args.trim else None)
+    policy = _convert(args, args.out)
     size, file = args.out.stat().st_size, shorten(args.out, PATH)
     print(f"{file}: {size / 1000:,.1f} kB, format {FORMAT_VERSION}, weights {policy.fingerprint}")
     return 0
+
+
+def _write_header(args: ExportArgs) -> int:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy"
+        policy = _convert(args, path)
+        size = export_header(path, args.out, policy.fingerprint)
+    print(f"{shorten(args.out, PATH)}: {size / 1000:,.1f} kB, C99, weights {policy.fingerprint}")
+    return 0
+
+
+def _convert(args: ExportArgs, out: Path) -> Policy:
+    path = find_policy(args.policy)
+    return convert_policy(path, out, args.action, _leg_trim(path) if args.trim else None)
 
 
 def _leg_trim(path: Path) -> np.ndarray:
