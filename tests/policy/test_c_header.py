@@ -288,7 +288,7 @@ def test_every_fault_has_its_code_state_and_sentence(
         kind = {
             *((Fault.READING, "nan"), (Fault.LATE, "late"), (Fault.STALE, "stale")),
             *((Fault.LEAN, "lean"), (Fault.TILT, "tilt"), (Fault.AWAY, "away")),
-            *((Fault.TEMPERATURE, "hot"), (Fault.TORQUE, "strain"), (Fault.TUMBLING, "fall")),
+            *((Fault.TEMPERATURE, "hot"), (Fault.TORQUE, "still"), (Fault.TUMBLING, "fall")),
         }
         play(pair, dict(kind)[fault], 150, 3)
     if fault in (Fault.TORQUE, Fault.TEMPERATURE, Fault.TUMBLING):
