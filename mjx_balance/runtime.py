@@ -462,14 +462,16 @@ class Controller:
             self._check_time(now - last)
         self._add_load(0, torques)
         self._add_load(1, temperatures)
-        self._sum += self._reading[-IMU:]
-        self._calls += 1
-        if first or self._calls == self._per_sample:
+        if self._per_sample > 1:
+            self._sum += self._reading[-IMU:]
+            self._calls += 1
+            if not first and self._calls < self._per_sample:
+                return
             self._reading[-IMU:] = self._sum / self._calls
             self._begin_sample()
-            balanced = self.state is State.BALANCING
-            self._advance(now)
-            self._record(self.state is State.BALANCING and not balanced)
+        balanced = self.state is State.BALANCING
+        self._advance(now)
+        self._record(self.state is State.BALANCING and not balanced)
 
     def _advance(self, now: float) -> None:
         """Takes a sample; checks and decides if that is due, and updates the targets."""
