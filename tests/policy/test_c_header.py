@@ -121,13 +121,18 @@ def test_it_decides_as_the_runtime_in_an_evaluation(name: str, build_shipped: An
     assert compare_evaluation(name, build_shipped(SHIPPED[name]), "corner", 2, 30.0) >= 298
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
-def test_it_decides_as_the_runtime_at_10000_decisions(name: str, build_shipped: Any) -> None:
+@pytest.mark.parametrize(
+    "scenarios", [pytest.param(1, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.long)]
+)
+def test_it_decides_as_the_runtime_with_every_policy(
+    name: str, scenarios: int, build_shipped: Any
+) -> None:
+    """At 900 decisions each, or at 10,800."""
     decisions = 0
     for suite in ("corner", "push", "noise"):
-        decisions += compare_evaluation(name, build_shipped(SHIPPED[name]), suite, 12, 60.0)
-    assert decisions >= 10_000
+        decisions += compare_evaluation(name, build_shipped(SHIPPED[name]), suite, scenarios, 60.0)
+    assert decisions >= 890 * scenarios
 
 
 LAYOUTS: dict[str, tuple[str, dict[str, Any]]] = {
