@@ -37,7 +37,7 @@ def export(argv: list[str]) -> int:
     args = tyro.cli(ExportArgs, args=argv, prog="mjx-balance export")
     writers = {".onnx": _write_onnx, ".h": _write_header, ".safetensors": _write_safetensors}
     if args.out.suffix not in writers:
-        return complain(f"out is {args.out}; its name must end in {', '.join(writers)}")
+        return complain(f"out is {args.out}; its name must end in .onnx, .h or .safetensors")
     return writers[args.out.suffix](args)
 
 

@@ -423,7 +423,7 @@ def test_options_that_cannot_be_are_refused(trimmed: tuple[Path, Any], tmp_path:
 @pytest.mark.parametrize("out", ["policy.c", "policy", "policy.hpp", "policy.H"])
 def test_another_suffix_is_refused(out: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "best", "--out", out]) == 2
-    expected = f"out is {out}; its name must end in .onnx, .h, .safetensors\n"
+    expected = f"out is {out}; its name must end in .onnx, .h or .safetensors\n"
     assert capsys.readouterr().err == f"mjx-balance: {expected}"
 
 

@@ -163,7 +163,10 @@ def test_file_says_what_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     [
         (("none.safetensors", "--out", "p.onnx"), "no policy file at none.safetensors"),
         (("text", "--out", "p.onnx"), "text is damaged or no safetensors file"),
-        ((str(SHIPPED), "--out", "p.h5"), "out is p.h5; its name must end in .onnx or .safeten"),
+        (
+            (str(SHIPPED), "--out", "p.h5"),
+            "out is p.h5; its name must end in .onnx, .h or .safetensors",
+        ),
         ((str(SHIPPED), "--out", "no/p.safetensors"), "cannot write no/p.safetensors: No such"),
         ((str(SHIPPED), "--out", "no/p.onnx"), "cannot write no/p.onnx: No such file or directory"),
         ((str(SHIPPED), "--out", "folder.onnx"), "cannot write folder.onnx: Is a directory"),
