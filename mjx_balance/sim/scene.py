@@ -402,10 +402,11 @@ def _is_at_targets(layout: Layout, data: mujoco.MjData) -> bool:
 
 def _endures(layout: Layout, data: mujoco.MjData) -> bool:
     """Whether the robot is still, and comes to rest again after a nudge."""
+    if not _is_still(layout, data):
+        return False
     nudged = copy.copy(data)
     nudged.qvel[layout.trunk_velocity] += NUDGE
-    if _is_still(layout, data):
-        _step(layout.model, nudged, NUDGE_STEPS)
+    _step(layout.model, nudged, NUDGE_STEPS)
     return _is_still(layout, nudged)
 
 
