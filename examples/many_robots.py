@@ -85,7 +85,7 @@ def train(configs: Mapping[str, Config], unseen: Mapping[str, Config], out: Path
         print(f"{done:,} decisions, {took:.0f} s, mean tilt {tilt:.3f} deg", file=sys.stderr)
     out.mkdir(parents=True, exist_ok=True)
     for name, config in {**configs, **unseen}.items():
-        for weights, manifest in exports(config, learner, load_scene(config).hash, state):
+        for weights, manifest in exports(config, learner, load_scene(config), state):
             save_policy(out / f"{name}.safetensors", weights, manifest)
 
 
