@@ -122,7 +122,9 @@ def run_command(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         return check_install(rest)
     if program == "python" and rest[0] == "train.py":
         program, rest = "mjx-balance", ["train", *rest[1:]]
-    if program == "python":
+    if program.startswith("examples/robot/build/"):
+        check_program(program, rest)
+    elif program == "python":
         run_script(rest)
     elif program == "mjx-balance":
         try:
@@ -146,7 +148,8 @@ def stand_ins(rest: list[str]) -> list[str]:
 def run_make(rest: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """What `make` would run, and that in turn."""
     assert [x for x in rest if "=" not in x], "make without a target"
-    makefile = (REPO / "Makefile").read_text()
+    folder = REPO / rest[rest.index("-C") + 1] if "-C" in rest else REPO
+    makefile = (folder / "Makefile").read_text()
     for name, value in (x.split("=", 1) for x in rest if "=" in x):
         assert f"$({name})" in makefile or f"$(if $({name})" in makefile, f"no variable {name}"
         extras = value.split(",") if name == "EXTRAS" else []
@@ -155,6 +158,8 @@ def run_make(rest: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     outer = "MAKEFLAGS MFLAGS MAKELEVEL MAKEOVERRIDES ARGS EXTRAS PYTHON VENV".split()
     own = {name: value for name, value in os.environ.items() if name not in outer}
     command = ["make", "--dry-run", "--no-print-directory", "--directory", str(REPO), *rest]
+    if folder != REPO:  # where all may be built already
+        command.append("--always-make")
     made = subprocess.run(command, capture_output=True, text=True, env=own)
     assert made.returncode == 0, made.stderr
     assert "Nothing to be done" not in made.stdout, made.stdout
@@ -172,6 +177,15 @@ def check_install(rest: list[str]) -> str:
         extras = ours.partition("[")[2].rstrip("]").split(",")
         assert set(extras) <= set(PROJECT["optional-dependencies"]), ours
     return ""
+
+
+def check_program(program: str, rest: list[str]) -> None:
+    """A program in C++ that tests/test_cpp_example.py builds and runs: its usage has the flags."""
+    name = Path(program).name
+    usage = (REPO / f"examples/robot/{name}.cpp").read_text().partition("USAGE[]")[2]
+    usage = usage.partition(";")[0]
+    for word in rest:
+        assert not word.startswith("-") or re.search(rf"\[{word}\b", usage), f"{name} has no {word}"
 
 
 def run_script(rest: list[str]) -> None:
@@ -331,6 +345,15 @@ def test_snippets_run(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
             elif kind == "c":  # beside the header that the command before it writes
                 command = [compiler("gcc"), "-std=c99", "-fsyntax-only", "-w", "-xc", "-I.", "-"]
                 subprocess.run(command, input=snippet.text, text=True, check=True)
+            elif kind == "cpp":
+                command = [
+                    compiler("g++"),
+                    "-std=c++17",
+                    "-fsyntax-only",
+                    "-xc++",
+                    "-Iexamples/robot",
+                ]
+                subprocess.run([*command, "-"], input=snippet.text, text=True, check=True)
             elif kind == "diff":  # of a worked example: it applies to today's code
                 check = ("git", "apply", "--check", "-C1", "-")
                 subprocess.run(check, input=snippet.text, text=True, check=True, cwd=REPO)
@@ -447,6 +470,8 @@ BROKEN: list[tuple[str, str]] = [
     ("sh", 'pip install "mjx-balance[robots]"'),
     ("sh", "srun mjx-balance train --distribute"),
     ("sh", "curl somewhere"),
+    ("sh", "examples/robot/build/balance sim --quick"),
+    ("sh", "make -C examples/robot ROBOT=go2"),
     ("yaml", "args: [mjx-balance train --process-idx 0]"),
     ("toml", '[legs]\nFL = "FL_hip"'),
 ]
