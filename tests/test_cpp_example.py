@@ -289,12 +289,13 @@ class Robot:
     def state(self, after: float = 1.0, **other: Any) -> bytes:
         """The next sample, so many periods after the last one; `other` are readings or flags."""
         self.now, self.sequence = self.now + 0.004 * after, self.sequence + 1
+        self.sequence %= 2**32
         noise = self.rng.normal(0, (*[0.002] * 3, *[0.02] * 3)).astype(np.float32)
         flags = other.pop("flags", 0)
         readings: dict[str, Any] = {
             "joints": self.controller.targets.astype(np.float32),
             "gyro": noise[:3],
-            "accelerometer": noise[3:] + np.float32([0, 0, 9.81]),
+            "accelerometer": noise[3:] + np.asarray([0, 0, 9.81], np.float32),
             "quaternion": [1, 0, 0, 0],
             "torques": np.zeros(JOINTS),
         } | other
@@ -449,6 +450,43 @@ def test_impossible_readings_hold(connect: Callable[..., Robot]) -> None:
     code, said = robot.end()
     assert code == 1
     assert "HOLDING, a reading is no number in its sensor's range: nan\n" in said
+
+
+def test_a_tilted_quaternion_holds(connect: Callable[..., Robot]) -> None:
+    """By 25 deg, whatever the accelerometer says."""
+    robot = connect("--lockstep", "--seconds", "0.008")
+    robot.step()
+    robot.send(robot.state(quaternion=[np.cos(0.218), 0, np.sin(0.218), 0]))
+    robot.receive()
+    code, said = robot.end()
+    assert code == 1
+    assert "HOLDING, the quaternion is tilted" in said
+
+
+def test_overloaded_servos_hold(connect: Callable[..., Robot]) -> None:
+    """The knees at 44 N m of 45.4, in the mean of a decision."""
+    robot = connect("--lockstep", "--seconds", "0.204")
+    for _ in range(51):
+        robot.send(robot.state(torques=[0, 0, -44] * 4))
+        robot.receive()
+    code, said = robot.end()
+    assert code == 1
+    assert "HOLDING, a servo is at its torque limit (N m): 44\n" in said
+
+
+def test_it_says_hello_until_the_robot_answers_and_numbers_begin_again(
+    connect: Callable[..., Robot],
+) -> None:
+    """After 2^32 - 1 comes 0, which is not old."""
+    robot = connect("--lockstep", "--seconds", "0.024")
+    hellos = [Packet.parse(robot.socket.recv(2048)) for _ in range(2)]
+    assert [(x.kind, x.sequence, x.answers) for x in hellos] == [(HELLO, 2, 0), (HELLO, 3, 0)]
+    assert hellos[1].time - hellos[0].time > 0.09
+    robot.sequence = 2**32 - 4
+    for _ in range(6):
+        robot.step()
+    assert robot.sequence == 2
+    assert robot.end() == (0, "50.004 s: BALANCING\npackets: 6 taken, 0 old, 0 garbage\n")
 
 
 def test_it_damps_when_the_robot_has_damped_itself(connect: Callable[..., Robot]) -> None:
