@@ -12,6 +12,7 @@
 #include "udp_robot.hpp"
 
 static_assert(MJXB_JOINTS == JOINTS, "the policy's robot must have four legs");
+static_assert(MJXB_HAS_GAINS && MJXB_HAS_TRIM, "the policy must know gains: export it with --trim");
 
 namespace {
 
@@ -29,14 +30,11 @@ const char USAGE[] =
 
 class Balancer {
 public:
-    explicit Balancer(bool stand_up)
+    explicit Balancer(bool stand_up) : stand_up_(stand_up)
     {
         mjxb_options options = mjxb_default_options();
         options.gains = stand_up;
-        if (!mjxb_init(&controller_, &options)) {
-            throw Error("the policy does not know the gains of its servos");
-        }
-        stand_up_ = stand_up;
+        mjxb_init(&controller_, &options);
     }
 
     // Runs the loop, for so many samples at most; returns the last state.
@@ -96,7 +94,7 @@ private:
     }
 
     mjxb_controller controller_;
-    bool stand_up_;
+    const bool stand_up_;
 };
 
 void check_joints(const SimulatedRobot &robot)

@@ -38,7 +38,8 @@ def records(
     """Name -> array: the model's bytes, float64 for all else.
 
     Raises:
-      InputError: for a suite that changes more than the board and the start.
+      InputError: for a suite that changes more than the board and the start, or for a robot that
+        lies on a tilted board.
     """
     task, model, stance = scene.task, scene.model, scene.stance
     check_fits(task, scenarios, duration, recorded=2)
@@ -49,6 +50,8 @@ def records(
             f"suite is {suite}; the simulation in C++ knows boards and starts only: paper, corner, "
             "fast, steep, recover, steps, sea or platform"
         )
+    if lying and episodes.scenario.start is not None:
+        raise InputError(f"suite is {suite}; a robot can lie only on a board that starts level")
     time = task.sim_dt * np.arange(
         1, math.ceil(duration / task.ctrl_dt - 1e-9) * task.sim_steps + 1
     )
@@ -135,8 +138,11 @@ def main(argv: list[str] | None = None) -> None:
     except InputError as error:
         parser.error(str(error))
     parts = [f"{name} {x.nbytes}\n".encode() + x.tobytes() for name, x in arrays.items()]
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(args.out, b"".join(parts))
+    try:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(args.out, b"".join(parts))
+    except OSError as error:
+        parser.error(f"{args.out} cannot be written: {error.strerror}")
     print(f"{args.out}: {args.scenarios} scenarios of {args.suite}, {args.duration:g} s each")
 
 
