@@ -191,7 +191,8 @@ def optimized(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 @pytest.mark.parametrize(
     ("policy", "suite", "scenarios", "seconds"),
     [
-        *(("best", "corner", 16, 60.0), ("real", "corner", 4, 60.0), ("go2", "corner", 2, 20.0)),
+        *(("best", "corner", 16, 60.0), ("real", "corner", 4, 60.0)),
+        *(("go2", "corner", 2, 20.0), ("spot", "corner", 2, 20.0)),
         *(("best", x, 2, 30.0) for x in ("paper", "fast", "steep", "recover", "steps", "sea")),
         ("real", "platform", 2, 30.0),
     ],
@@ -204,15 +205,17 @@ def test_every_suite_that_only_moves_boards(
     tmp_path: Path,
     optimized: Callable[[str], Path],
 ) -> None:
-    """Go2 obeys commands late; `recover` starts tilted; a platform has five axes."""
+    """Spot obeys commands late; `recover` starts tilted; a platform has five axes."""
     size = ("--suite", suite, "--scenarios", str(scenarios), "--duration", str(seconds))
     file = scene_file(tmp_path, *size, "--seed", "7000000", policy=policy)
     code, said, errors = run(optimized(policy) / "balance", "sim", "--fast", "--scene", file)
     assert (code, errors) == (0, "")
     expected = evaluation(policy, suite, scenarios, seconds, 7000000)
     assert not expected.fell.any()
+    # Servos with dry friction amplify the last bits: the runtime in Python is as far away.
+    agree = SAME if policy in ("best", "real") else 1e-3
     close = expected.tilt.mean(), expected.tilt.max()
-    assert tilts(said) == pytest.approx(close, abs=SAME)
+    assert tilts(said) == pytest.approx(close, abs=agree)
 
 
 def records(file: Path) -> dict[str, bytes]:
@@ -441,6 +444,18 @@ def test_what_comes_late_holds(connect: Callable[..., Robot]) -> None:
     assert "HOLDING, a sample came too late" in said
 
 
+def test_it_ends_when_the_robot_is_silent(connect: Callable[..., Robot]) -> None:
+    """After 2 s."""
+    robot = connect()
+    robot.send(robot.state())
+    robot.receive()
+    began = time.monotonic()
+    code, said, errors = end(robot.program)
+    assert time.monotonic() - began > 1.8
+    assert (code, errors) == (1, "balance: the robot is silent\n")
+    assert said.endswith(" s: BALANCING\npackets: 1 taken, 0 old, 0 garbage\n")
+
+
 def test_impossible_readings_hold(connect: Callable[..., Robot]) -> None:
     """Numbers that a damaged sensor gives, in a packet that is whole."""
     robot = connect("--lockstep", "--seconds", "0.008")
@@ -658,10 +673,9 @@ def test_random_datagrams_do_no_harm(
             whole[4:-4] = rng.bytes(len(whole) - 8)
             whole[-4:] = struct.pack("<I", zlib.crc32(whole[:-4]))
         send(bytes(whole) if k % 4 < 2 else rng.bytes(int(rng.integers(1400))))
-        if k % 40 == 0:
-            time.sleep(0.001)  # loopback has a queue, too
+        if k % 40 == 39:
+            ask()  # nothing is lost in a queue
         assert program.poll() is None
-    ask()
 
 
 MISTAKES: list[tuple[list[str], str]] = [
@@ -672,6 +686,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["balance", "sim", "--scene", "nowhere"], "balance: nowhere is no scene of this version of"),
     (["balance", "sim", "--scene", "cut"], "balance: cut is no scene of this version of MuJoCo ("),
     (["balance", "sim", "--scene", "renamed"], "balance: the scene has no leg_dofs"),
+    (["balance", "udp", "127.0.0.1", "9"], "balance: no robot answers at 127.0.0.1:9\n"),
     (["balance", "udp", "no.where.invalid", "9"], "balance: no.where.invalid:9 is no address: "),
     (["fake_robot"], "usage: fake_robot PORT "),
     (["fake_robot", "70000"], "usage: fake_robot PORT "),

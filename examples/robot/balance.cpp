@@ -137,12 +137,16 @@ int connect(const std::string &host, const std::string &port, double seconds, bo
             bool lockstep)
 {
     UdpRobot robot(host, port, lockstep);
-    const mjxb_state state =
-        Balancer(stand_up).run(robot, std::lround(seconds / MJXB_SAMPLE_S));
-    std::printf("packets: %ld taken, %ld old, %ld garbage\n", robot.taken, robot.old,
-                robot.garbage);
+    const long samples = std::lround(seconds / MJXB_SAMPLE_S);
+    const mjxb_state state = Balancer(stand_up).run(robot, samples);
     if (robot.taken == 0) {
         throw Error("no robot answers at " + host + ":" + port);
+    }
+    std::printf("packets: %ld taken, %ld old, %ld garbage\n", robot.taken, robot.old,
+                robot.garbage);
+    if (robot.taken < samples) {
+        std::fprintf(stderr, "balance: the robot is silent\n");
+        return 1;
     }
     return state == MJXB_BALANCING ? 0 : 1;
 }

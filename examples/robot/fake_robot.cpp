@@ -20,7 +20,7 @@ const char USAGE[] =
     "--everywhere  listen at all addresses of this machine, not only at the loopback\n";
 
 constexpr std::uint32_t WATCHDOG = 12;  // samples without a command, 48 ms, after which it damps
-constexpr double SILENCE = 2.0;         // s after which a robot in lockstep gives up
+constexpr double SILENCE = 20.0;        // s after which a robot in lockstep gives up
 
 class Server {
 public:

@@ -2,8 +2,14 @@
 
 #include <algorithm>
 
+namespace {
+
+constexpr double HELLO = 0.1;  // s from one hello to the next
+
+}
+
 UdpRobot::UdpRobot(const std::string &host, const std::string &port, bool robot_clock)
-    : socket_(host, port), robot_clock_(robot_clock)
+    : socket_(host, port), robot_clock_(robot_clock), silence_(robot_clock ? 20.0 : 2.0)
 {
 }
 
@@ -23,14 +29,14 @@ bool UdpRobot::read(Sensors &sensors)
 {
     const double began = now();
     double said_hello = -HELLO;
-    for (double passed = 0; passed < SILENCE; passed = now() - began) {
+    for (double passed = 0; passed < silence_; passed = now() - began) {
         if (taken == 0 && passed - said_hello >= HELLO) {
             hello();
             said_hello = passed;
         }
         std::uint8_t bytes[MOST_BYTES];
         Socket::Address from;
-        const double wait = std::min(taken == 0 ? HELLO : SILENCE, SILENCE - passed);
+        const double wait = std::min(taken == 0 ? HELLO : silence_, silence_ - passed);
         const long size = socket_.receive(bytes, sizeof bytes, wait, from);
         if (size < 0) {
             continue;

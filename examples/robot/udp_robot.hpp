@@ -12,14 +12,12 @@ public:
     // robot_clock: a sample's time is that of the robot, not of its arrival here. For a robot that
     // waits for every command, whose time is not ours.
     UdpRobot(const std::string &host, const std::string &port, bool robot_clock);
-    // False: the robot has been silent for SILENCE s.
+    // False: the robot has been silent for 2 s, or 20 s if it waits for us.
     bool read(Sensors &sensors) override;
     void write(const Targets &targets) override;
 
     // Packets: taken; not after the last one; damaged, or none of ours.
     long taken = 0, old = 0, garbage = 0;
-
-    static constexpr double SILENCE = 2.0, HELLO = 0.1;
 
 private:
     void hello();
@@ -27,6 +25,7 @@ private:
 
     Socket socket_;
     const bool robot_clock_;
+    const double silence_;  // s
     const std::chrono::steady_clock::time_point began_ = std::chrono::steady_clock::now();
     std::uint32_t sequence_ = 0, last_ = 0;
 };
