@@ -822,6 +822,7 @@ class _Inputs:
 
     def __init__(self, rows: list[dict[str, Any]], legs: int, sample_dt: float) -> None:
         channels = {"height": legs, "command": legs, "gyro": 3, "accelerometer": 3}
+        self._channels = legs
         self._ages = dict.fromkeys(channels, 1)
         groups: dict[tuple[str, int], list[tuple[int, int, int]]] = {}
         slow = [k for k, row in enumerate(rows) if row.get("time_constant") is not None]
