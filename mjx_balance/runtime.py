@@ -71,6 +71,7 @@ WEIGHT = (0.5 * 9.81, 1.5 * 9.81)  #: norm of the mean acceleration, m/s^2; push
 LEAN_MOST = 40.0  #: greatest angle of it from z, deg; a fall has 6, but a push can look like 29
 AWAY_MOST = 0.5  #: greatest error of a joint at a decision, rad; pushes give 0.03
 KNEE_SLACK = 0.1  #: tolerance of a knee's reading beyond its stops, rad
+LYING_SLACK = 0.3  #: the same before and after balancing: a robot that lies presses on its stops
 STUCK_MOST = 0.1  #: greatest motion of a target while its joint's reading stays the same, rad
 RECENT = (10, 50)  #: bounds of the number of IMU samples that are checked for repetitions
 LIVELY = 1 / 3  #: least share of different ones; there the mean tilt is a fifth greater
@@ -254,6 +255,8 @@ class Controller:
         most = np.repeat((GYRO_MOST, ACCEL_MOST), 3)
         self._least, self._most = np.append(low, -most), np.append(high, most)
         self._reading = np.zeros_like(self._most)
+        self._lying = np.zeros_like(self._most)
+        self._lying[2:-IMU:3] = LYING_SLACK - KNEE_SLACK
         self._set_up_servos(manifest)
 
     def _set_up_servos(self, manifest: dict[str, Any]) -> None:
@@ -403,7 +406,7 @@ class Controller:
             self._read_sensors(joint_positions, gyro, accelerometer)
             if self.state is State.PASSIVE:
                 self._check_reading()
-                self._targets = self._reading[:-IMU].reshape(-1, 3).copy()
+                self._targets = self._pose()
                 self.reason = ""
             elif not ended:
                 self._take(self._time(), quaternion, torques, temperatures)
@@ -483,8 +486,8 @@ class Controller:
         elif self.state is State.STANDING_UP and self._way is None:
             self._fill(imu)
             self._way = self._plan_way()
-            self._there, self._decided = self._reading[:-IMU].copy(), now
-            self._targets = self._way.at(0)[0]
+            self._targets, self._decided = self._way.at(0)[0], now
+            self._there = self._targets.ravel()
             self._check_posture()
         else:
             self._seen += 1
@@ -539,10 +542,16 @@ class Controller:
 
     def _plan_way(self) -> _Way:
         """Plans to stand up: the feet come under the hips, then the legs become longer."""
-        pose, low = self._reading[:-IMU].reshape(-1, 3).copy(), self._legs.height_range[0]
-        height = min(max(float(self._legs.foot_heights(pose).min()), low), self._height)
+        pose, low = self._pose(), self._legs.height_range[0]
+        heights = self._legs.foot_heights(self._reading[:-IMU].reshape(pose.shape))
+        height = min(max(float(heights.min()), low), self._height)
         crouch = self._legs.joint_angles(np.full(len(pose), height))
         return _Way(pose, crouch, self._path[0], self.sample_dt)
+
+    def _pose(self) -> np.ndarray:
+        """Joint angles (legs, 3), rad, of which a target may be made: within their range."""
+        joints = np.clip(self._reading[:-IMU], self._least[:-IMU], self._most[:-IMU])
+        return joints.reshape(-1, 3)
 
     def _watch(self, quaternion: Any) -> None:
         """Checks that a robot that is HOLDING has not fallen."""
@@ -569,13 +578,16 @@ class Controller:
         )
 
     def _check_reading(self) -> None:
-        sane = (self._least <= self._reading) & (self._reading <= self._most)  # NaN is not
+        stands = self.state in (State.STANDING, State.BALANCING)
+        more = 0.0 if stands else self._lying
+        least, most = self._least - more, self._most + more
+        sane = (least <= self._reading) & (self._reading <= most)  # NaN is not
         k = int(sane.argmin())
         if not sane[k]:
             raise _Unsafe(
                 Fault.READING,
                 f"{self._name(k)} reads {self._reading[k]:.3g}, which is not between "
-                f"{self._least[k]:.3g} and {self._most[k]:.3g}",
+                f"{least[k]:.3g} and {most[k]:.3g}",
             )
 
     def _name(self, k: int) -> str:

@@ -89,6 +89,7 @@ def constants(controller: Controller) -> str:
         "HIGHEST": legs.height_range[1],
         "GYRO_MOST": runtime.GYRO_MOST,
         "ACCEL_MOST": runtime.ACCEL_MOST,
+        "LYING_MORE": runtime.LYING_SLACK - runtime.KNEE_SLACK,
         "WEIGHT_LEAST": runtime.WEIGHT[0],
         "WEIGHT_MOST": runtime.WEIGHT[1],
         "LEAN_MOST": runtime.LEAN_MOST,

@@ -223,7 +223,9 @@ def test_it_does_what_the_runtime_does_whatever_happens(
             play(pair, "still", 1, 0)
         pair.act("stand")
         low, high = pair.python._legs.limits()
-        pose = low + np.random.default_rng(len(segments)).random(12) * (high - low)
+        beyond = np.tile((0.0, 0.0, 0.25), 4)
+        shares = np.random.default_rng(len(segments)).random(12)
+        pose = low - beyond + shares * (high - low + 2 * beyond)
         pair.step(pose.reshape(4, 3), [0, 0, 0], [0, 0, 9.81])
         play(pair, "still", 260 if len(segments) % 2 else 900 * calls, 1)
     for segment in segments:
