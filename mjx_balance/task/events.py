@@ -3,6 +3,7 @@
 A load is laid on the trunk or slides, a foot gets onto a slippery patch, a servo weakens.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,22 @@ class Event(NamedTuple):
     payload_at: Float[Array, "*batch 3"]  #: where, in the trunk's frame, m
     grip: Float[Array, "*batch legs"]  #: factor on the sliding friction of every foot
     strength: Float[Array, "*batch legs 3"]  #: factor on the position gain of every leg servo
+
+
+def sample_event(
+    ranges: RandomizationConfig,
+    robot: Robot,
+    params: DomainParams | None,
+    decisions: int,
+    uniform: Callable[[int], Array],
+) -> Event | None:
+    """`draw_event`, or None if nothing happens or no parameters are random.
+
+    `uniform` returns so many random numbers in [0, 1) for every env; only an event calls it.
+    """
+    if params is None or not ranges.happens:
+        return None
+    return draw_event(ranges, robot, params, decisions, uniform(DRAWS))
 
 
 def draw_event(
