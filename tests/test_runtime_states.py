@@ -137,7 +137,7 @@ def test_it_stands_up_smoothly_and_then_balances(rig: Rig) -> None:
 def test_it_stands_up_from_any_pose_without_a_jump(shares: list[float]) -> None:
     """Of all that the joints can read: never beyond their range nor faster than 1 rad/s."""
     rig = Rig()
-    low, high = rig.controller._legs.limits()
+    low, high = rig.controller.model.legs.limits()
     beyond = np.tile((0.0, 0.0, LYING_SLACK - KNEE_SLACK), 4)
     rig.joints = (low - beyond + np.asarray(shares) * (high - low + 2 * beyond)).reshape(4, 3)
     first = np.clip(rig.joints, low.reshape(4, 3), high.reshape(4, 3))
@@ -548,7 +548,7 @@ class Lying:
         lowest = joint_angles(robot, np.full(4, robot.height_range[0] + 0.02))
         self.controller = Controller(path, lambda: self.data.time, gains=True)
         # A model may have no stops, as mini_cheetah's: the knees get those of its legs.
-        low, high = np.reshape(self.controller._legs.limits(), (2, 4, 3))
+        low, high = np.reshape(self.controller.model.legs.limits(), (2, 4, 3))
         low[:, 2] += KNEE_SLACK
         high[:, 2] -= KNEE_SLACK
         for leg in range(4):

@@ -15,7 +15,7 @@ from onnx.reference import ReferenceEvaluator
 
 from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.policy.onnx import Graph, Tensors, best_action, best_point
-from mjx_balance.runtime import IMU, Controller, State
+from mjx_balance.runtime import IMU, Controller, Model, State
 
 ABOUT = (
     "Controller of mjx_balance: a sample of the sensors and the state in, joint targets (rad) and "
@@ -43,14 +43,14 @@ def export_controller(path: Path, out: Path) -> tuple[int, int]:
       RuntimeError: if the model's targets are not those of the runtime.
       OSError: if `out` cannot be written; an old file then stays.
     """
-    model = controller_model(Controller(path))
+    model = controller_model(Controller(path).model)
     _check(model, path)
     content = model.SerializeToString()
     write_atomically(out, content)
     return len(content), model.graph.input[-1].type.tensor_type.shape.dim[0].dim_value
 
 
-def controller_model(controller: Controller) -> onnx.ModelProto:
+def controller_model(model: Model) -> onnx.ModelProto:
     """Returns what a controller does while it balances as an ONNX model of one sample.
 
     All is float64 but `decided`. Inputs: `joint_positions` (legs, 3) rad, `gyro` (3,) rad/s,
@@ -58,10 +58,12 @@ def controller_model(controller: Controller) -> onnx.ModelProto:
     (legs, 3) rad, `command` (2,) height changes of the last decision, m, `decided` (), whether this
     sample made a decision, and `next_state` (n,). The metadata holds `manifest` as JSON.
     """
-    c, graph = controller, Graph()
-    legs, samples = len(c.joints), c._inputs.lookback("gyro", "accelerometer")
-    rows = max(len(c._commands), 2)  # the ramp goes from the last but one to the last
-    means = len(c._inputs._slow)
+    graph = Graph()
+    legs, samples = len(model.joints), model.inputs.lookback("gyro", "accelerometer")
+    rows = max(
+        model.inputs.lookback("command"), 2
+    )  # the ramp goes from the last but one to the last
+    means = len(model.inputs.slow)
     sizes = [1, 2, rows * legs, samples * IMU, means, means]
     sizes = sizes if means else sizes[:-2]
     parts = [f"state_{k}" for k in range(len(sizes))]
@@ -69,35 +71,35 @@ def controller_model(controller: Controller) -> onnx.ModelProto:
     count, command, commands, imu, *leaky = parts
 
     first = graph.add("Equal", count, np.zeros(1))
-    due = graph.add("Equal", count, np.asarray([float(c.decision_samples)]))
+    due = graph.add("Equal", count, np.asarray([float(model.decision_samples)]))
     decides = graph.add("Or", first, due)
     sample = graph.add("Concat", "gyro", "accelerometer", axis=0)
     imu = graph.add("Reshape", imu, np.asarray([samples, IMU]))
     imu = graph.add("Where", first, sample, _pushed(graph, imu, sample, samples))
     commands = graph.add("Reshape", commands, np.asarray([rows, legs]))
-    commands = graph.add("Where", first, np.asarray(c._height), commands)
+    commands = graph.add("Where", first, np.asarray(model.height), commands)
     if means:
-        leaky = _leaky_means(graph, c._inputs.means, sample, first, leaky)
+        leaky = _leaky_means(graph, model.inputs.means, sample, first, leaky)
 
-    heights = _foot_heights(graph, c._legs, "joint_positions")
-    observation = _observation(graph, c._inputs, heights, commands, imu, leaky, rows, samples)
-    out = _network(graph, c._network, observation)
-    command = graph.add("Where", decides, _command(graph, c, out), command)
+    heights = _foot_heights(graph, model.legs, "joint_positions")
+    observation = _observation(graph, model.inputs, heights, commands, imu, leaky, rows, samples)
+    out = _network(graph, model.network, observation)
+    command = graph.add("Where", decides, _command(graph, model, out), command)
 
     before = graph.columns(commands, rows - 1, rows, axis=0)
-    changes = graph.add("MatMul", command, c._legs._sides)
+    changes = graph.add("MatMul", command, model.legs.sides)
     after = graph.add(
-        "Clip", graph.add("Add", before, changes), *map(np.asarray, c._legs.height_range)
+        "Clip", graph.add("Add", before, changes), *map(np.asarray, model.legs.height_range)
     )
     commands = graph.add("Where", decides, _pushed(graph, commands, after, rows), commands)
     count = graph.add("Where", decides, np.ones(1), graph.add("Add", count, np.ones(1)))
 
-    ramp = float(len(c._share))
+    ramp = float(len(model.share))
     share = graph.add("Div", graph.add("Min", count, np.asarray(ramp)), np.asarray(ramp))
     before, after = (graph.columns(commands, k, k + 1, axis=0) for k in (rows - 2, rows - 1))
     rest = graph.add("Mul", before, graph.add("Sub", np.ones(1), share))
     heights = graph.add("Add", rest, graph.add("Mul", after, share))
-    targets = _joint_angles(graph, c._legs, graph.add("Reshape", heights, np.asarray([legs])))
+    targets = _joint_angles(graph, model.legs, graph.add("Reshape", heights, np.asarray([legs])))
 
     # 0, or NaN once a reading or an output of the network is not finite; the count keeps that.
     values = [graph.flat(x) for x in ("joint_positions", out)]
@@ -116,7 +118,7 @@ def controller_model(controller: Controller) -> onnx.ModelProto:
     inputs: Tensors = {"joint_positions": joints, "gyro": axes, "accelerometer": axes}
     outputs: Tensors = {"targets": joints, "command": (real, (2,)), "decided": (np.bool_, ())}
     inputs["state"] = outputs["next_state"] = state
-    return graph.model("controller", ABOUT, inputs, outputs, c.manifest)
+    return graph.model("controller", ABOUT, inputs, outputs, model.manifest)
 
 
 def _check(model: onnx.ModelProto, path: Path) -> None:
@@ -152,21 +154,21 @@ def _leaky_means(
 ) -> list[str]:
     """Sums and weights after a sample, as `runtime._Means`."""
     values = sample
-    if means._angle.any():
+    if means.angle.any():
         x, y, z = (graph.columns(sample, 3 + k, 4 + k, axis=0) for k in range(3))
         across = graph.add("Sqrt", graph.add("Add", *(graph.add("Mul", k, k) for k in (y, z))))
         pitch = _angle(graph, graph.add("Neg", x), across)
         values = graph.add("Concat", sample, _angle(graph, y, z), pitch, axis=0)
-    values = graph.add("Gather", values, means._places)
-    if means._angle.any():
-        times, turns = np.zeros(len(means._places)), np.zeros(len(means._places), int)
-        times[means._angle], turns[means._angle] = means._times, means._turns
+    values = graph.add("Gather", values, means.places)
+    if means.angle.any():
+        times, turns = np.zeros(len(means.places)), np.zeros(len(means.places), int)
+        times[means.angle], turns[means.angle] = means.times, means.turns
         turned = graph.add("Mul", graph.add("Gather", sample, turns), times)
         values = graph.add("Add", values, turned)
-    starts = (graph.add("Mul", values, means._start), means._start)
+    starts = (graph.add("Mul", values, means.first), means.first)
     result = []
     for old, start, new in zip(sums_and_weights, starts, (values, np.ones(1)), strict=True):
-        step = graph.add("Mul", graph.add("Sub", new, old), means._leak)
+        step = graph.add("Mul", graph.add("Sub", new, old), means.leak)
         result.append(graph.add("Where", first, start, graph.add("Add", old, step)))
     return result
 
@@ -182,7 +184,7 @@ def _observation(
     samples: int,
 ) -> str:
     """The network's inputs (1, size), float32, as `runtime._Inputs`."""
-    legs = inputs._channels
+    legs = inputs.channels
     pool = graph.add("Concat", heights, graph.flat(commands), graph.flat(imu), axis=0)
     # Sensor: where its newest sample is in the pool, and how far apart its samples are.
     last = legs * rows, legs * (1 + rows) + IMU * (samples - 1)
@@ -191,8 +193,8 @@ def _observation(
     values, places = [], []
     if leaky:
         values.append(graph.add("Div", *leaky))
-        places += inputs._slow
-    for sensor, group, steps, index in inputs._groups:
+        places += inputs.slow
+    for sensor, group, steps, index in inputs.groups:
         start, stride = newest[sensor]
         sought = (start + (steps + 1) * stride + index).astype(np.int32)
         values.append(
@@ -200,7 +202,7 @@ def _observation(
         )
         places += group.tolist()
     value = graph.add("Gather", graph.add("Concat", *values, axis=0), np.argsort(places))
-    value = graph.add("Div", graph.add("Sub", value, inputs._offset), inputs._scale)
+    value = graph.add("Div", graph.add("Sub", value, inputs.offset), inputs.scale)
     value = graph.add("Cast", value, to=TensorProto.FLOAT)
     return graph.add("Reshape", value, np.asarray([1, -1]))
 
@@ -208,59 +210,59 @@ def _observation(
 def _network(graph: Graph, network: Any, observation: str) -> str:
     """Outputs (1, n) of the network, float32, as `runtime._Network`: its sums are in float64."""
     x = observation
-    for k, (kernel, bias) in enumerate(network._layers):
-        if k == len(network._layers) - 1 and network.radial:
+    for k, (kernel, bias) in enumerate(network.layers):
+        if k == len(network.layers) - 1 and network.radial:
             x = graph.add("Concat", x, observation, axis=1)
         # The file holds weights as float32; a session makes float64 of them once.
         arrays = (x, kernel.astype(np.float32), bias.astype(np.float32))
         double = (graph.add("Cast", y, to=TensorProto.DOUBLE) for y in arrays)
         x = graph.add("Cast", graph.add("Gemm", *double), to=TensorProto.FLOAT)
-        if k < len(network._layers) - 1:
+        if k < len(network.layers) - 1:
             x = graph.add("Relu", x)
     return x
 
 
-def _command(graph: Graph, controller: Controller, out: str) -> str:
+def _command(graph: Graph, model: Model, out: str) -> str:
     """Height changes (2,) of the best action, m."""
-    network = controller._network
-    if controller._continuous:
-        point = graph.add("Mul", best_point(graph, out, 2), controller._half)
-        command = graph.add("Add", point, controller._middle)
+    network = model.network
+    if model.continuous:
+        point = graph.add("Mul", best_point(graph, out, 2), model.half)
+        command = graph.add("Add", point, model.middle)
         command = graph.add("Cast", command, to=TensorProto.DOUBLE)
     else:
         action = best_action(graph, out, network.factors, network.radial)
-        command = graph.add("Gather", controller._table, action)
+        command = graph.add("Gather", model.table, action)
     return graph.flat(command)
 
 
 def _foot_heights(graph: Graph, legs: Any, angles: str) -> str:
     """(legs,) m for joint angles (legs, 3), as `runtime._Legs`."""
-    turned = graph.add("Add", graph.add("Mul", angles, legs._signs), legs._zeros)
+    turned = graph.add("Add", graph.add("Mul", angles, legs.signs), legs.zeros)
     abduction, thigh, knee = (graph.add("Gather", turned, np.asarray(k), axis=1) for k in range(3))
-    upper = graph.add("Mul", graph.add("Cos", thigh), legs._a)
-    lower = graph.add("Mul", graph.add("Cos", graph.add("Add", thigh, knee)), legs._b)
-    length = graph.add("Add", graph.add("Add", upper, lower), legs._drop)
+    upper = graph.add("Mul", graph.add("Cos", thigh), legs.thigh)
+    lower = graph.add("Mul", graph.add("Cos", graph.add("Add", thigh, knee)), legs.calf)
+    length = graph.add("Add", graph.add("Add", upper, lower), legs.drop)
     down = graph.add("Mul", length, graph.add("Cos", abduction))
-    aside = graph.add("Mul", graph.add("Sin", abduction), legs._offset)
-    return graph.add("Add", graph.add("Sub", down, aside), legs._lift)
+    aside = graph.add("Mul", graph.add("Sin", abduction), legs.offset)
+    return graph.add("Add", graph.add("Sub", down, aside), legs.lift)
 
 
 def _joint_angles(graph: Graph, legs: Any, heights: str) -> str:
     """(legs, 3) rad for foot heights (legs,), as `runtime._Legs`."""
-    a, b = legs._a, legs._b
-    length = graph.add("Sub", heights, legs._rise)
+    a, b = legs.thigh, legs.calf
+    length = graph.add("Sub", heights, legs.rise)
     cosine = graph.add("Sub", graph.add("Mul", length, length), a**2 + b**2)
     one = np.asarray(1.0)
     cosine = graph.add("Clip", graph.add("Div", cosine, 2 * a * b), -one, one)
     square = graph.add("Mul", graph.add("Sub", one, cosine), graph.add("Add", one, cosine))
-    sine = graph.add("Mul", graph.add("Sqrt", square), legs._bends)
+    sine = graph.add("Mul", graph.add("Sqrt", square), legs.bends)
     knee = _angle(graph, sine, cosine)
     ahead = graph.add("Add", graph.add("Mul", cosine, b), a)
     thigh = graph.add("Neg", _angle(graph, graph.add("Mul", sine, b), ahead))
     zero = graph.add("Mul", thigh, np.asarray(0.0))
     columns = [graph.add("Unsqueeze", x, np.asarray([1])) for x in (zero, thigh, knee)]
-    turned = graph.add("Sub", graph.add("Concat", *columns, axis=1), legs._zeros)
-    return graph.add("Mul", turned, legs._signs)
+    turned = graph.add("Sub", graph.add("Concat", *columns, axis=1), legs.zeros)
+    return graph.add("Mul", turned, legs.signs)
 
 
 def _angle(graph: Graph, y: str, x: str) -> str:

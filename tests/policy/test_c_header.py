@@ -73,7 +73,7 @@ class Pair:
         assert (np.abs(c.targets - python._targets) <= self.agree).all()
         if python.command is not None:
             assert (np.abs(c.command - python.command) <= 1e-8).all()
-        if python._gains is not None:
+        if python.model.gains is not None:
             torque = 0.0 if python.torque is None else python.torque
             for own, expected in zip(
                 c.gains, (python.stiffness, python.damping, torque), strict=True
@@ -222,7 +222,7 @@ def test_it_does_what_the_runtime_does_whatever_happens(
         if gains:
             play(pair, "still", 1, 0)
         pair.act("stand")
-        low, high = pair.python._legs.limits()
+        low, high = pair.python.model.legs.limits()
         beyond = np.tile((0.0, 0.0, 0.25), 4)
         shares = np.random.default_rng(len(segments)).random(12)
         pose = low - beyond + shares * (high - low + 2 * beyond)

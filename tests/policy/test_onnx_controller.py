@@ -22,7 +22,7 @@ from mjx_balance.policy import onnx_controller
 from mjx_balance.policy.file import load_policy, shipped_policies
 from mjx_balance.policy.onnx import Graph, Tensors
 from mjx_balance.policy.onnx_controller import controller_model, export_controller
-from mjx_balance.runtime import Controller, State
+from mjx_balance.runtime import Controller, Model, State
 
 SHIPPED = shipped_policies()
 AGREE = 1e-9
@@ -43,7 +43,7 @@ class Pair:
     def __init__(self, path: Path):
         self.now = 0.0
         self.python = Controller(path, lambda: self.now)
-        self._session = session(controller_model(self.python))
+        self._session = session(controller_model(self.python.model))
         self.size = self._session.get_inputs()[-1].shape[0]
         self.reset()
 
@@ -230,11 +230,11 @@ def test_a_model_that_is_not_the_runtime_is_not_written(
 ) -> None:
     """One of its numbers is off by a thousandth."""
 
-    def damaged(controller: Controller) -> onnx.ModelProto:
-        model = controller_model(controller)
+    def damaged(policy: Model) -> onnx.ModelProto:
+        model = controller_model(policy)
         for k, constant in enumerate(model.graph.initializer):
             array = numpy_helper.to_array(constant)
-            if array.dtype == float and array.shape == controller._legs._a.shape:
+            if array.dtype == float and array.shape == policy.legs.thigh.shape:
                 model.graph.initializer[k].CopyFrom(
                     numpy_helper.from_array(array * 1.001, constant.name)
                 )
