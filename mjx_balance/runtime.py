@@ -71,6 +71,7 @@ WEIGHT = (0.5 * 9.81, 1.5 * 9.81)  #: norm of the mean acceleration, m/s^2; push
 LEAN_MOST = 40.0  #: greatest angle of it from z, deg; a fall has 6, but a push can look like 29
 AWAY_MOST = 0.5  #: greatest error of a joint at a decision, rad; pushes give 0.03
 KNEE_SLACK = 0.1  #: tolerance of a knee's reading beyond its stops, rad
+LYING_SLACK = 0.3  #: the same before and after balancing: a robot that lies presses on its stops
 STUCK_MOST = 0.1  #: greatest motion of a target while its joint's reading stays the same, rad
 RECENT = (10, 50)  #: bounds of the number of IMU samples that are checked for repetitions
 LIVELY = 1 / 3  #: least share of different ones; there the mean tilt is a fifth greater
@@ -190,90 +191,36 @@ class Controller:
         """
         try:
             content = _content(Path(path))
-            self.manifest, weights = _read(content)
-            self._set_up(self.manifest, weights)
-            if gains and self._gains is None:
+            self.model = model = Model(content)
+            if gains and model.gains is None:
                 raise PolicyFileError("it does not say the stiffness and damping of its servos")
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             name = _line(path, MOST_PATH)
             message = _line(f"{name} cannot be used: {_reason(error)}", MOST_MESSAGE)
             raise PolicyFileError(message) from error
+        self.manifest = model.manifest
+        self.joints = model.joints
+        """Names of the abduction, hip and knee joints of every leg, in the order of `step`."""
+        self.sample_dt = model.sample_dt
+        """Time between two IMU samples, s."""
+        self.decision_samples = model.decision_samples
+        """IMU samples per decision."""
         self._clock, self._obeyed = clock, gains
         self._per_sample = self._calls_per_sample(sample_rate)
-        if max_torque is not None:
-            self._most_loads[0] = np.broadcast_to(max_torque, (len(self.joints), 3)).ravel()
-        self._most_loads[1] = max_temperature
-        size = min(math.ceil(LOG_S / self.sample_dt), MOST_LOG)
-        self._log = _Log(size, len(self.joints), content)
-        self.reset()
-
-    def _set_up(self, manifest: dict[str, Any], weights: dict[str, np.ndarray]) -> None:
-        """Reads the manifest, and allocates the histories."""
-        self._legs = legs = _Legs(manifest["robot"])
-        self.joints: list[list[str]] = [_names(leg["joints"]) for leg in manifest["robot"]["legs"]]
-        """Names of the abduction, hip and knee joints of every leg, in the order of `step`."""
-        timing = manifest["timing"]
-        self.sample_dt = _number("sample_s", timing["sample_s"], 1e-4, 1)
-        """Time between two IMU samples, s."""
-        self.decision_samples = _whole(
-            "decision_samples", timing["decision_samples"], 1, MOST_SAMPLES
-        )
-        """IMU samples per decision."""
-        self._decision_dt = self.decision_samples * self.sample_dt
-        # The rate from a fall on one side to a fall on the other within a decision.
-        fall = math.radians(_number("fail_tilt_deg", manifest["fail_tilt_deg"], 0, 90))
-        self._rate_most = 2 * fall / self._decision_dt
-        ramp = _whole("ramp_samples", timing["ramp_samples"], 1, self.decision_samples)
-        self._share = (np.arange(1, ramp + 1) / ramp)[:, None]
-        self._height = _number("body_height_m", manifest["body_height_m"], *legs.height_range)
-        action = manifest.get("action", "grid")  # the first files do not say
-        if action not in ACTIONS:
-            raise PolicyFileError(
-                f"its action is {_quote(action)}; this file runs {' and '.join(ACTIONS)}"
-            )
-        self._table = _numbers("table_m", manifest["actions"]["table_m"], (None, 2))
-
-        self._inputs = inputs = _Inputs(manifest["inputs"], len(self.joints), self.sample_dt)
-        self._recent = min(max(self.decision_samples, RECENT[0]), RECENT[1])
-        self._history = max(inputs.lookback("gyro", "accelerometer"), self._recent)
+        legs = len(self.joints)
+        limits = model.torque_limits if max_torque is None else max_torque
+        torques = np.broadcast_to(limits, (legs, 3)).ravel()
+        self._most_loads = np.stack((torques, np.full(3 * legs, max_temperature)))
         # Joints at the decisions of the time that is checked for repetitions.
-        self._poses: deque[np.ndarray] = deque(maxlen=-(-self._recent // self.decision_samples))
+        decisions = -(-model.recent // self.decision_samples)
+        self._poses: deque[np.ndarray] = deque(maxlen=decisions)
         # The history up to the last decision, then the samples since.
-        self._imu = np.empty((self._history + self.decision_samples, IMU))
-        self._commands = np.empty((inputs.lookback("command"), len(self.joints)))
-        self._network = _Network(manifest["network"], inputs.size, weights)
-        if len(self._table) != math.prod(self._network.factors):
-            raise PolicyFileError("its action table is not what its network chooses from")
-        self._continuous = action == "continuous"
-        if self._continuous and not (self._network.radial and len(self._network.factors) == 2):
-            raise PolicyFileError("its action is 'continuous', but its network is not radial")
-        low, high = self._table.min(axis=0), self._table.max(axis=0)
-        self._middle, self._half = np.float32((low + high) / 2), np.float32((high - low) / 2)
-
-        low, high = legs.limits()
-        most = np.repeat((GYRO_MOST, ACCEL_MOST), 3)
-        self._least, self._most = np.append(low, -most), np.append(high, most)
-        self._reading = np.zeros_like(self._most)
-        self._set_up_servos(manifest)
-
-    def _set_up_servos(self, manifest: dict[str, Any]) -> None:
-        """Reads gains, trim and torque limits; files may lack them."""
-        robot, shape = manifest["robot"], (len(self.joints), 3)
-        self._gains: np.ndarray | None = None
-        self._trim: np.ndarray | None = None
-        gains = [robot.get(name) for name in ("servo_stiffness", "servo_damping")]
-        if None not in gains:
-            gains = [np.broadcast_to(np.asarray(gain, float), shape) for gain in gains]
-            self._gains = _numbers("servo_stiffness and servo_damping", gains, (2, *shape))
-            if not (self._gains >= 0).all():
-                raise PolicyFileError("its servos have gains below 0")
-        if manifest.get("leg_trim_rad") is not None:
-            self._trim = _numbers("leg_trim_rad", manifest["leg_trim_rad"], shape)
-            if not (abs(self._trim) <= TRIM_MOST).all():
-                raise PolicyFileError(f"its leg_trim_rad goes beyond {TRIM_MOST:g} rad")
-        torques = [robot.get(name) or math.inf for name in ("hip_torque", "knee_torque")]
-        most = TORQUE_SHARE * np.asarray([torques[0], torques[0], torques[1]], float)
-        self._most_loads = np.stack((np.tile(most, shape[0]), np.full(math.prod(shape), math.inf)))
+        self._imu = np.empty((model.history + self.decision_samples, IMU))
+        self._commands = np.empty((model.inputs.lookback("command"), legs))
+        self._reading = np.zeros_like(model.most)
+        size = min(math.ceil(LOG_S / self.sample_dt), MOST_LOG)
+        self._log = _Log(size, legs, content)
+        self.reset()
 
     def _calls_per_sample(self, rate: float | None) -> int:
         if rate is None:
@@ -294,12 +241,12 @@ class Controller:
     @property
     def stiffness(self) -> np.ndarray | None:
         """(legs, 3) position gains of the servos, N m / rad; None if the file does not say them."""
-        return None if self._gains is None else self._stiff * self._gains[0]
+        return None if self.model.gains is None else self._stiff * self.model.gains[0]
 
     @property
     def damping(self) -> np.ndarray | None:
         """(legs, 3) damping of the servos, N m s / rad; None if the file does not say it."""
-        return None if self._gains is None else float(self._damped) * self._gains[1]
+        return None if self.model.gains is None else float(self._damped) * self.model.gains[1]
 
     @property
     def torque(self) -> np.ndarray | None:
@@ -307,9 +254,9 @@ class Controller:
 
         It replaces the trim of the targets. None if the file does not say the trim.
         """
-        if self._gains is None or self._trim is None:
+        if self.model.gains is None or self.model.trim is None:
             return None
-        return self._loaded * self._gains[0] * self._trim
+        return self._loaded * self.model.gains[0] * self.model.trim
 
     def reset(self) -> None:
         """Starts again, STANDING, or PASSIVE if the servos obey the gains.
@@ -321,8 +268,8 @@ class Controller:
         self.reason = ""  #: the same in a sentence
         self.action: int | None = None  #: index of the last action, or of the nearest on the grid
         self.command: np.ndarray | None = None  #: its height changes a_x and a_y, m
-        self._commands[:] = self._height
-        self._path = self._legs.joint_angles(self._commands[-1:])
+        self._commands[:] = self.model.height
+        self._path = self.model.legs.joint_angles(self._commands[-1:])
         self._targets = self._path[0]
         self._since = self._seen = self._gaps = self._risen = 0
         self._called = self._decided = math.nan
@@ -403,7 +350,7 @@ class Controller:
             self._read_sensors(joint_positions, gyro, accelerometer)
             if self.state is State.PASSIVE:
                 self._check_reading()
-                self._targets = self._reading[:-IMU].reshape(-1, 3).copy()
+                self._targets = self._pose()
                 self.reason = ""
             elif not ended:
                 self._take(self._time(), quaternion, torques, temperatures)
@@ -483,13 +430,13 @@ class Controller:
         elif self.state is State.STANDING_UP and self._way is None:
             self._fill(imu)
             self._way = self._plan_way()
-            self._there, self._decided = self._reading[:-IMU].copy(), now
-            self._targets = self._way.at(0)[0]
+            self._targets, self._decided = self._way.at(0)[0], now
+            self._there = self._targets.ravel()
             self._check_posture()
         else:
             self._seen += 1
-            self._imu[self._history + self._since] = imu
-            self._inputs.means.add(imu)
+            self._imu[self.model.history + self._since] = imu
+            self.model.inputs.means.add(imu)
             self._since += 1
             if self._since == self.decision_samples:
                 self._end_decision(now)
@@ -503,7 +450,7 @@ class Controller:
     def _fill(self, imu: np.ndarray) -> None:
         """Fills the histories with a sample (6,) of a robot that is still."""
         self._imu[:] = imu
-        self._inputs.means.start(imu)
+        self.model.inputs.means.start(imu)
         self._poses.clear()
         self._poses.append(self._reading[:-IMU].copy())
         self._there = self._targets.ravel()
@@ -523,7 +470,7 @@ class Controller:
         if self.state is State.BALANCING:
             self._decide(now)
             return
-        samples = self._imu[self._history :]
+        samples = self._imu[self.model.history :]
         done = self._way is not None and self._risen > self._way.samples + self.decision_samples
         if done and (abs(samples[:, :3]) <= STILL_RATE).all():
             self._way = None
@@ -534,15 +481,21 @@ class Controller:
             self._next_decision(now)
 
     def _next_decision(self, now: float) -> None:
-        self._imu[: self._history] = self._imu[-self._history :]
+        self._imu[: self.model.history] = self._imu[-self.model.history :]
         self._since, self._decided = 0, now
 
     def _plan_way(self) -> _Way:
         """Plans to stand up: the feet come under the hips, then the legs become longer."""
-        pose, low = self._reading[:-IMU].reshape(-1, 3).copy(), self._legs.height_range[0]
-        height = min(max(float(self._legs.foot_heights(pose).min()), low), self._height)
-        crouch = self._legs.joint_angles(np.full(len(pose), height))
+        pose, low = self._pose(), self.model.legs.height_range[0]
+        heights = self.model.legs.foot_heights(self._reading[:-IMU].reshape(pose.shape))
+        height = min(max(float(heights.min()), low), self.model.height)
+        crouch = self.model.legs.joint_angles(np.full(len(pose), height))
         return _Way(pose, crouch, self._path[0], self.sample_dt)
+
+    def _pose(self) -> np.ndarray:
+        """Joint angles (legs, 3), rad, of which a target may be made: within their range."""
+        joints = np.clip(self._reading[:-IMU], self.model.least[:-IMU], self.model.most[:-IMU])
+        return joints.reshape(-1, 3)
 
     def _watch(self, quaternion: Any) -> None:
         """Checks that a robot that is HOLDING has not fallen."""
@@ -569,13 +522,16 @@ class Controller:
         )
 
     def _check_reading(self) -> None:
-        sane = (self._least <= self._reading) & (self._reading <= self._most)  # NaN is not
+        stands = self.state in (State.STANDING, State.BALANCING)
+        more = 0.0 if stands else self.model.lying
+        least, most = self.model.least - more, self.model.most + more
+        sane = (least <= self._reading) & (self._reading <= most)  # NaN is not
         k = int(sane.argmin())
         if not sane[k]:
             raise _Unsafe(
                 Fault.READING,
                 f"{self._name(k)} reads {self._reading[k]:.3g}, which is not between "
-                f"{self._least[k]:.3g} and {self._most[k]:.3g}",
+                f"{least[k]:.3g} and {most[k]:.3g}",
             )
 
     def _name(self, k: int) -> str:
@@ -596,22 +552,22 @@ class Controller:
     def _check_rate(self, now: float) -> None:
         """Checks the sample rate since the last decision."""
         took, most = now - self._decided, LATE_SAMPLES * self.sample_dt
-        if abs(took - self._decision_dt) > most:
+        if abs(took - self.model.decision_dt) > most:
             raise _Unsafe(
                 Fault.RATE,
                 f"{self.decision_samples} samples took {took:.3g} s; they must take "
-                f"{self._decision_dt:.3g} s within {most:.3g}, as in training",
+                f"{self.model.decision_dt:.3g} s within {most:.3g}, as in training",
             )
 
     def _check_liveness(self) -> None:
         """Checks that the IMU's samples differ, and that joints move if their targets do."""
-        recent = self._imu[-self._recent :]
+        recent = self._imu[-self.model.recent :]
         different = len(set(recent.view(f"V{recent.itemsize * IMU}")[:, 0].tolist()))
         self._check_new("IMU", different, len(recent), LIVELY)
         self._check_latest((recent[1:] != recent[:-1]).any(axis=1))
         joints, targets = self._reading[:-IMU], self._targets.ravel()
         if np.abs(joints - self._poses[0]).max() > MOVED_LEAST:
-            since = self._imu[-max(self._recent, self.decision_samples) :]
+            since = self._imu[-max(self.model.recent, self.decision_samples) :]
             changed = (since[1:] != since[:-1]).reshape(-1, 2, 3).any(axis=2)
             for name, new in zip(SENSORS, (1 + changed.sum(axis=0)).tolist()):
                 self._check_new(name, new, len(since), LIVELY_SENSOR)
@@ -630,7 +586,7 @@ class Controller:
         """Checks that the newest samples, of which the policy knows most, are no gap in bursts."""
         count = len(new) // 3
         latest, least = int(new[-count:].sum()), int(count * LIVELY)
-        gap = latest < least and self.decision_samples >= self._recent
+        gap = latest < least and self.decision_samples >= self.model.recent
         self._gaps = self._gaps + 1 if gap else 0
         if self._gaps == 2:
             raise _Unsafe(
@@ -641,7 +597,7 @@ class Controller:
 
     def _check_new(self, name: str, new: int, count: int, share: float) -> None:
         """Checks that enough of a sensor's last `count` samples are new."""
-        least = max(2, round(share * self._recent))
+        least = max(2, round(share * self.model.recent))
         if new < least and self._seen >= count:
             raise _Unsafe(
                 Fault.STALE,
@@ -651,7 +607,7 @@ class Controller:
 
     def _check_posture(self) -> None:
         """Checks the mean of a decision's IMU samples, and the joints, for a balancing robot."""
-        x, y, _, *accel = self._imu[self._history :].mean(axis=0).tolist()
+        x, y, _, *accel = self._imu[self.model.history :].mean(axis=0).tolist()
         weight, rate = math.hypot(*accel), math.hypot(x, y)
         if not WEIGHT[0] <= weight <= WEIGHT[1]:
             raise _Unsafe(
@@ -661,11 +617,11 @@ class Controller:
             )
         self._check_lean(accel)
         # Who stands up may tip from its side onto its feet.
-        if rate > self._rate_most and self.state is not State.STANDING_UP:
+        if rate > self.model.rate_most and self.state is not State.STANDING_UP:
             raise _Unsafe(
                 Fault.TUMBLING,
                 f"the gyro gives {rate:.3g} rad/s about x and y in the mean of a decision, more "
-                f"than {self._rate_most:.3g}: the robot falls, or these are no rad/s",
+                f"than {self.model.rate_most:.3g}: the robot falls, or these are no rad/s",
             )
         errors = np.abs(self._reading[:-IMU] - self._targets.ravel())
         k = int(errors.argmax())
@@ -734,22 +690,24 @@ class Controller:
 
     def _decide(self, now: float) -> None:
         """Chooses an action, and computes its ramp of targets, `_path`."""
-        self.action, best = self._network.greedy(self._observation())
-        command = self._table[self.action].copy()
-        if self._continuous:
-            command = self._middle + self._half * best
+        self.action, best = self.model.network.greedy(self._observation())
+        command = self.model.table[self.action].copy()
+        if self.model.continuous:
+            command = self.model.middle + self.model.half * best
         before = self._commands[-1].copy()
-        after = self._legs.moved(before, command)
+        after = self.model.legs.moved(before, command)
         self._commands[:-1] = self._commands[1:]
         self._commands[-1] = after
-        self._path = self._legs.joint_angles(before * (1 - self._share) + after * self._share)
+        self._path = self.model.legs.joint_angles(
+            before * (1 - self.model.share) + after * self.model.share
+        )
         self.command = command
         self._next_decision(now)
 
     def _observation(self) -> np.ndarray:
-        return self._inputs.observe(
+        return self.model.inputs.observe(
             {
-                "height": self._legs.foot_heights(self._reading[:-IMU].reshape(-1, 3))[None],
+                "height": self.model.legs.foot_heights(self._reading[:-IMU].reshape(-1, 3))[None],
                 "command": self._commands,
                 "gyro": self._imu[:, :3],
                 "accelerometer": self._imu[:, 3:],
@@ -814,6 +772,85 @@ class _Log:
 _CODES = {state: code for code, state in enumerate(State)}  # in the log
 
 
+class Model:
+    """What a policy file says: the robot, the network's inputs and weights, and limits."""
+
+    def __init__(self, content: bytes) -> None:
+        """Reads a file's content.
+
+        Raises:
+          PolicyFileError, KeyError, TypeError, ValueError, OverflowError, AttributeError: if it is
+            damaged, or not a policy that this file can run.
+        """
+        self.manifest, weights = _read(content)
+        manifest = self.manifest
+        self.legs = legs = _Legs(manifest["robot"])
+        self.joints: list[list[str]] = [_names(leg["joints"]) for leg in manifest["robot"]["legs"]]
+        timing = manifest["timing"]
+        self.sample_dt = _number("sample_s", timing["sample_s"], 1e-4, 1)
+        self.decision_samples = _whole(
+            "decision_samples", timing["decision_samples"], 1, MOST_SAMPLES
+        )
+        self.decision_dt = self.decision_samples * self.sample_dt  #: s
+        # The rate from a fall on one side to a fall on the other within a decision.
+        fall = math.radians(_number("fail_tilt_deg", manifest["fail_tilt_deg"], 0, 90))
+        self.rate_most = 2 * fall / self.decision_dt  #: rad/s
+        ramp = _whole("ramp_samples", timing["ramp_samples"], 1, self.decision_samples)
+        self.share = (np.arange(1, ramp + 1) / ramp)[
+            :, None
+        ]  #: of a command, at the ramp's samples
+        self.height = _number("body_height_m", manifest["body_height_m"], *legs.height_range)
+        action = manifest.get("action", "grid")  # the first files do not say
+        if action not in ACTIONS:
+            raise PolicyFileError(
+                f"its action is {_quote(action)}; this file runs {' and '.join(ACTIONS)}"
+            )
+        self.table = _numbers("table_m", manifest["actions"]["table_m"], (None, 2))
+
+        self.inputs = inputs = _Inputs(manifest["inputs"], len(self.joints), self.sample_dt)
+        self.recent = min(max(self.decision_samples, RECENT[0]), RECENT[1])
+        """Newest IMU samples, which are checked for repetitions."""
+        self.history = max(inputs.lookback("gyro", "accelerometer"), self.recent)
+        """IMU samples before those of a decision that are kept."""
+        self.network = _Network(manifest["network"], inputs.size, weights)
+        if len(self.table) != math.prod(self.network.factors):
+            raise PolicyFileError("its action table is not what its network chooses from")
+        self.continuous = action == "continuous"
+        if self.continuous and not (self.network.radial and len(self.network.factors) == 2):
+            raise PolicyFileError("its action is 'continuous', but its network is not radial")
+        low, high = self.table.min(axis=0), self.table.max(axis=0)
+        self.middle, self.half = np.float32((low + high) / 2), np.float32((high - low) / 2)
+
+        low, high = legs.limits()
+        most = np.repeat((GYRO_MOST, ACCEL_MOST), 3)
+        self.least, self.most = np.append(low, -most), np.append(high, most)
+        self.lying = np.zeros_like(self.most)
+        """How far readings may be beyond `least` and `most` while the robot does not balance."""
+        self.lying[2:-IMU:3] = LYING_SLACK - KNEE_SLACK
+        self._read_servos()
+
+    def _read_servos(self) -> None:
+        """Reads gains, trim and torque limits; files may lack them."""
+        robot, shape = self.manifest["robot"], (len(self.joints), 3)
+        self.gains: np.ndarray | None = None
+        """(2, legs, 3) stiffness, N m / rad, and damping, N m s / rad."""
+        self.trim: np.ndarray | None = None
+        """(legs, 3) rad that the targets lack to bear the robot."""
+        gains = [robot.get(name) for name in ("servo_stiffness", "servo_damping")]
+        if None not in gains:
+            gains = [np.broadcast_to(np.asarray(gain, float), shape) for gain in gains]
+            self.gains = _numbers("servo_stiffness and servo_damping", gains, (2, *shape))
+            if not (self.gains >= 0).all():
+                raise PolicyFileError("its servos have gains below 0")
+        if self.manifest.get("leg_trim_rad") is not None:
+            self.trim = _numbers("leg_trim_rad", self.manifest["leg_trim_rad"], shape)
+            if not (abs(self.trim) <= TRIM_MOST).all():
+                raise PolicyFileError(f"its leg_trim_rad goes beyond {TRIM_MOST:g} rad")
+        torques = [robot.get(name) or math.inf for name in ("hip_torque", "knee_torque")]
+        most = TORQUE_SHARE * np.asarray([torques[0], torques[0], torques[1]], float)
+        self.torque_limits = np.broadcast_to(most, shape)  #: (legs, 3) N m
+
+
 class _Inputs:
     """The network's inputs: (mean of `window` samples from `lag` on - offset) / scale.
 
@@ -822,10 +859,11 @@ class _Inputs:
 
     def __init__(self, rows: list[dict[str, Any]], legs: int, sample_dt: float) -> None:
         channels = {"height": legs, "command": legs, "gyro": 3, "accelerometer": 3}
+        self.channels = legs
         self._ages = dict.fromkeys(channels, 1)
         groups: dict[tuple[str, int], list[tuple[int, int, int]]] = {}
         slow = [k for k, row in enumerate(rows) if row.get("time_constant") is not None]
-        self._slow, self.means = slow, _Means([rows[k] for k in slow], sample_dt)
+        self.slow, self.means = slow, _Means([rows[k] for k in slow], sample_dt)
         for k, row in enumerate(rows):
             if k in slow:
                 continue
@@ -844,12 +882,12 @@ class _Inputs:
         if samples > MOST_READ or any(self._ages[sensor] > 1 for sensor in MOMENTARY):
             raise PolicyFileError("its inputs are means of more samples than there are")
         self.size = len(rows)
-        self._offset = _numbers("offset", [row["offset"] for row in rows], (self.size,))
-        self._scale = np.asarray([_number("scale", row["scale"], *SCALES) for row in rows])
-        self._groups = []
+        self.offset = _numbers("offset", [row["offset"] for row in rows], (self.size,))
+        self.scale = np.asarray([_number("scale", row["scale"], *SCALES) for row in rows])
+        self.groups = []
         for (sensor, window), group in groups.items():
             places, index, lags = np.asarray(group, int).T
-            self._groups.append((sensor, places, -1 - np.arange(window)[:, None] - lags, index))
+            self.groups.append((sensor, places, -1 - np.arange(window)[:, None] - lags, index))
 
     def lookback(self, *sensors: str) -> int:
         """Number of samples of these sensors that the inputs need, the newest included."""
@@ -858,10 +896,10 @@ class _Inputs:
     def observe(self, samples: dict[str, np.ndarray]) -> np.ndarray:
         """Inputs (size,) from {sensor: samples (n, channels), the newest last}."""
         values = np.empty(self.size)
-        values[self._slow] = self.means.values()
-        for sensor, places, steps, index in self._groups:
+        values[self.slow] = self.means.values()
+        for sensor, places, steps, index in self.groups:
             values[places] = samples[sensor][steps, index].mean(axis=0)
-        return (values - self._offset) / self._scale
+        return (values - self.offset) / self.scale
 
 
 class _Means:
@@ -884,23 +922,23 @@ class _Means:
             first, count = kinds[sensor]
             places.append(first + _whole("index", row["index"], 0, count - 1))
             times.append(_number("time_constant", row["time_constant"], *TIMES))
-        self._places, tau = np.asarray(places, int), np.asarray(times)
-        self._angle = angle = self._places >= IMU
-        self._turns, self._times = self._places[angle] - IMU, tau[angle]
-        self._leak = sample_dt / (tau + sample_dt)
-        start = 1 - (1 - self._leak) ** round(STANDING_S / sample_dt)
-        self._start = np.where(angle, 1.0, start)
+        self.places, tau = np.asarray(places, int), np.asarray(times)
+        self.angle = angle = self.places >= IMU
+        self.turns, self.times = self.places[angle] - IMU, tau[angle]
+        self.leak = sample_dt / (tau + sample_dt)
+        start = 1 - (1 - self.leak) ** round(STANDING_S / sample_dt)
+        self.first = np.where(angle, 1.0, start)  #: weight of the first sample
 
     def start(self, imu: np.ndarray) -> None:
         """Takes the first sample (6,), of a robot that has been standing still."""
-        self._weight = self._start.copy()
+        self._weight = self.first.copy()
         self._sum = self._weight * self._samples(imu)
 
     def add(self, imu: np.ndarray) -> None:
         """Takes another sample (6,)."""
-        if len(self._leak):
-            self._sum += self._leak * (self._samples(imu) - self._sum)
-            self._weight += self._leak * (1 - self._weight)
+        if len(self.leak):
+            self._sum += self.leak * (self._samples(imu) - self._sum)
+            self._weight += self.leak * (1 - self._weight)
 
     def values(self) -> np.ndarray:
         """The means now, in the order of the rows."""
@@ -909,8 +947,8 @@ class _Means:
     def _samples(self, imu: np.ndarray) -> np.ndarray:
         x, y, z = imu[3:]
         gravity = math.atan2(y, z), math.atan2(-x, math.hypot(y, z))
-        samples = np.append(imu, gravity)[self._places]
-        samples[self._angle] += self._times * imu[self._turns]
+        samples = np.append(imu, gravity)[self.places]
+        samples[self.angle] += self.times * imu[self.turns]
         return samples
 
 
@@ -924,55 +962,55 @@ class _Legs:
             return _numbers(name, [leg[name] for leg in robot["legs"]], (count, *shape))
 
         radius = _numbers("foot_radius", robot["foot_radius"], ())
-        self._a, self._b, self._drop = each("thigh"), each("calf"), each("drop")
-        self._offset, axis_height = each("offset"), each("axis_height")
-        self._signs, self._zeros, self._knee = each("signs", 3), each("zeros", 3), each("knee", 2)
-        if not ((self._a > 0) & (self._b > 0)).all() or not (abs(self._signs) == 1).all():
+        self.thigh, self.calf, self.drop = each("thigh"), each("calf"), each("drop")
+        self.offset, axis_height = each("offset"), each("axis_height")
+        self.signs, self.zeros, self.knee = each("signs", 3), each("zeros", 3), each("knee", 2)
+        if not ((self.thigh > 0) & (self.calf > 0)).all() or not (abs(self.signs) == 1).all():
             raise PolicyFileError("its legs have lengths that are not above 0, or signs not +-1")
-        if not (abs(self._zeros) <= MOST_TURN).all():
+        if not (abs(self.zeros) <= MOST_TURN).all():
             raise PolicyFileError(f"its legs have zeros beyond {MOST_TURN:g} rad")
-        low, high = self._knee.T
-        self._bends = np.sign(low + high)
-        one_side = (low * high >= 0) & (low <= high) & (self._bends != 0)
-        if not (one_side & (abs(self._knee) <= math.pi).all(axis=-1)).all():
+        low, high = self.knee.T
+        self.bends = np.sign(low + high)
+        one_side = (low * high >= 0) & (low <= high) & (self.bends != 0)
+        if not (one_side & (abs(self.knee) <= math.pi).all(axis=-1)).all():
             raise PolicyFileError("its knees do not bend to one side, by at most half a turn")
         # Body height = `_rise` + distance from hip to foot, if the hip's axis is level.
-        self._rise = radius + self._drop - axis_height
-        self._lift = radius - axis_height
-        self._sides = np.where((each("left") != 0, each("front") != 0), 1.0, -1.0)
-        squared = self._a**2 + self._b**2
-        squared = squared[:, None] + 2 * (self._a * self._b)[:, None] * np.cos(self._knee)
-        reach = np.sqrt(np.maximum(squared, 0)) + self._rise[:, None]  # rounded: -1e-17
+        self.rise = radius + self.drop - axis_height
+        self.lift = radius - axis_height
+        self.sides = np.where((each("left") != 0, each("front") != 0), 1.0, -1.0)
+        squared = self.thigh**2 + self.calf**2
+        squared = squared[:, None] + 2 * (self.thigh * self.calf)[:, None] * np.cos(self.knee)
+        reach = np.sqrt(np.maximum(squared, 0)) + self.rise[:, None]  # rounded: -1e-17
         self.height_range = float(reach.min(axis=-1).max()), float(reach.max(axis=-1).min())
         """Least and greatest body height that all legs reach, m."""
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and greatest possible reading of all joints, (3 legs,) each, rad."""
-        turns = np.broadcast_to((-math.pi, math.pi), (*self._signs.shape, 2)).copy()
-        turns[:, 2] = self._knee + np.asarray((-KNEE_SLACK, KNEE_SLACK))
-        ends = self._signs[..., None] * (turns - self._zeros[..., None])
+        turns = np.broadcast_to((-math.pi, math.pi), (*self.signs.shape, 2)).copy()
+        turns[:, 2] = self.knee + np.asarray((-KNEE_SLACK, KNEE_SLACK))
+        ends = self.signs[..., None] * (turns - self.zeros[..., None])
         return ends.min(axis=-1).ravel(), ends.max(axis=-1).ravel()
 
     def moved(self, heights: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Foot heights (legs,) after an action (2,): left legs +a_x, front legs +a_y, m."""
-        moved = heights + change[0] * self._sides[0] + change[1] * self._sides[1]
+        moved = heights + change[0] * self.sides[0] + change[1] * self.sides[1]
         return np.clip(moved, *self.height_range)
 
     def joint_angles(self, heights: np.ndarray) -> np.ndarray:
         """(..., legs, 3) abduction, hip and knee angles, rad, for foot heights (..., legs), m."""
-        a, b = self._a, self._b
-        cosine = ((heights - self._rise) ** 2 - a**2 - b**2) / (2 * a * b)
-        knee = self._bends * np.arccos(np.clip(cosine, -1.0, 1.0))
+        a, b = self.thigh, self.calf
+        cosine = ((heights - self.rise) ** 2 - a**2 - b**2) / (2 * a * b)
+        knee = self.bends * np.arccos(np.clip(cosine, -1.0, 1.0))
         thigh = -np.arctan2(b * np.sin(knee), a + b * np.cos(knee))
         turned = np.stack((np.zeros_like(thigh), thigh, knee), axis=-1)
-        return self._signs * (turned - self._zeros)
+        return self.signs * (turned - self.zeros)
 
     def foot_heights(self, angles: np.ndarray) -> np.ndarray:
         """(legs,) m below the trunk's origin, foot radius included, for joint angles (legs, 3)."""
-        abduction, thigh, knee = (self._signs * angles + self._zeros).T
-        length = self._a * np.cos(thigh) + self._b * np.cos(thigh + knee)
-        down = (length + self._drop) * np.cos(abduction) - self._offset * np.sin(abduction)
-        return down + self._lift
+        abduction, thigh, knee = (self.signs * angles + self.zeros).T
+        length = self.thigh * np.cos(thigh) + self.calf * np.cos(thigh + knee)
+        down = (length + self.drop) * np.cos(abduction) - self.offset * np.sin(abduction)
+        return down + self.lift
 
 
 class _Network:
@@ -1000,7 +1038,7 @@ class _Network:
             if not np.isfinite(weights[name]).all():
                 raise PolicyFileError(f"weight {name} holds values that are not finite numbers")
         # Sums in float64: they are then the same in any order, also in a header in C.
-        self._layers = [
+        self.layers = [
             (weights[f"{name}/kernel"].astype(float), weights[f"{name}/bias"].astype(float))
             for name in names
         ]
@@ -1012,9 +1050,9 @@ class _Network:
         """
         with np.errstate(over="ignore", invalid="ignore"):
             obs = x = observation.astype(np.float32)
-            for kernel, bias in self._layers[:-1]:
+            for kernel, bias in self.layers[:-1]:
                 x = np.maximum((x @ kernel + bias).astype(np.float32), 0.0)
-            kernel, bias = self._layers[-1]
+            kernel, bias = self.layers[-1]
             x = np.concatenate((x, obs)) if self.radial else x
             out = (x @ kernel + bias).astype(np.float32)
         if not np.isfinite(out).all():

@@ -22,7 +22,15 @@ from mjx_balance.evaluation.rollout import policy_scene
 from mjx_balance.policy.file import find_policy, load_policy, read_policy
 from mjx_balance.policy.manifest import PolicyError, make_manifest
 from mjx_balance.robots.catalogue import find_robot
-from mjx_balance.runtime import RESPONSES, Controller, Fault, PolicyFileError, State
+from mjx_balance.runtime import (
+    KNEE_SLACK,
+    LYING_SLACK,
+    RESPONSES,
+    Controller,
+    Fault,
+    PolicyFileError,
+    State,
+)
 from mjx_balance.sim.scene import build_model
 from mjx_balance.task.attitude import body_tilt
 from mjx_balance.task.kinematics import joint_angles
@@ -129,14 +137,55 @@ def test_it_stands_up_smoothly_and_then_balances(rig: Rig) -> None:
 def test_it_stands_up_from_any_pose_without_a_jump(shares: list[float]) -> None:
     """Of all that the joints can read: never beyond their range nor faster than 1 rad/s."""
     rig = Rig()
-    low, high = rig.controller._legs.limits()
-    rig.joints = (low + np.asarray(shares) * (high - low)).reshape(4, 3)
-    first = rig.joints
+    low, high = rig.controller.model.legs.limits()
+    beyond = np.tile((0.0, 0.0, LYING_SLACK - KNEE_SLACK), 4)
+    rig.joints = (low - beyond + np.asarray(shares) * (high - low + 2 * beyond)).reshape(4, 3)
+    first = np.clip(rig.joints, low.reshape(4, 3), high.reshape(4, 3))
     path = np.stack([first, *(targets for targets, _, _ in rig.stand())])
     assert np.abs(np.diff(path, axis=0)).max() <= 0.004 + 1e-12
     assert (path >= low.reshape(4, 3) - 1e-9).all()
     assert (path <= high.reshape(4, 3) + 1e-9).all()
     np.testing.assert_allclose(path[-2], joint_angles(ROBOT, np.full(4, 0.35)), atol=1e-12)
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_it_stands_up_with_knees_that_press_on_their_stops(end: int, rig: Rig) -> None:
+    """They read 0.25 rad beyond their range, and all the time the same until the legs pull."""
+    controller = rig.controller
+    lying, stops = CROUCH.copy(), ROBOT.legs[0].knee[end]
+    lying[:, 2] = stops + (0.25 if end else -0.25)
+    rig.joints = lying
+    rig.step()
+    assert controller.reason == ""
+    np.testing.assert_allclose(controller.targets[:, 2], stops + (0.1 if end else -0.1))
+    controller.stand()
+    for _ in range(300):
+        rig.step(joint_positions=lying)
+    rig.step(2500)
+    assert controller.state is State.BALANCING, controller.reason
+    beyond = rig.joints.copy()
+    beyond[2, 2] = stops + (0.11 if end else -0.11)
+    rig.step(joint_positions=beyond)
+    assert (controller.state, controller.fault) == (State.HOLDING, Fault.READING)
+
+
+def test_knees_that_read_more_than_a_stop_allows_do_not_stand_up(rig: Rig) -> None:
+    controller, wrong = rig.controller, CROUCH.copy()
+    wrong[1, 2] = ROBOT.legs[1].knee[0] - 0.31
+    rig.step(joint_positions=wrong)
+    assert re.match("RF_knee reads .*, which is not between", controller.reason)
+    np.testing.assert_array_equal(controller.targets, joint_angles(ROBOT, np.full(4, 0.35)))
+    controller.stand()
+    rig.step(joint_positions=wrong)
+    assert (controller.state, controller.fault) == (State.HOLDING, Fault.READING)
+
+
+def test_who_holds_with_a_knee_on_its_stop_still_notices_a_fall(rig: Rig) -> None:
+    lying = CROUCH.copy()
+    lying[3, 2] = ROBOT.legs[3].knee[0] - 0.25
+    rig.controller.hold("it lies")
+    rig.step(51, joint_positions=lying, accelerometer=[0, 9.81, 0])
+    assert (rig.controller.state, rig.controller.fault) == (State.DAMPING, Fault.LEAN)
 
 
 def test_it_waits_until_the_robot_is_still(rig: Rig) -> None:
@@ -497,11 +546,17 @@ class Lying:
         self.scene, self.root = scene, scene.trunk_quat[0] - 3
         self.data, self.rng = mujoco.MjData(model), np.random.default_rng(seed)
         lowest = joint_angles(robot, np.full(4, robot.height_range[0] + 0.02))
-        low, high = model.jnt_range[ids].transpose(2, 0, 1)
+        self.controller = Controller(path, lambda: self.data.time, gains=True)
+        # A model may have no stops, as mini_cheetah's: the knees get those of its legs.
+        low, high = np.reshape(self.controller.model.legs.limits(), (2, 4, 3))
+        low[:, 2] += KNEE_SLACK
+        high[:, 2] -= KNEE_SLACK
+        for leg in range(4):
+            model.jnt_range[ids[leg][2]] = low[leg, 2], high[leg, 2]
+            model.jnt_limited[ids[leg][2]] = 1
         pose = lowest + self.rng.uniform(-1, 1, (4, 3)) * (0.3, 0.9, 0.6)
         self.data.qpos[self.qpos] = np.clip(pose, low + 0.02, high - 0.02)
         self.data.qpos[self.root + 2] = 0.3
-        self.controller = Controller(path, lambda: self.data.time, gains=True)
 
     def run(self, seconds: float) -> None:
         controller, data, model = self.controller, self.data, self.model
@@ -521,9 +576,12 @@ class Lying:
         return float(self.data.qpos[self.root + 2])
 
 
+LYING = (("go2", 5), ("spot", 8), ("mini_cheetah", 1))
+
+
 @pytest.mark.parametrize(
     ("name", "seed"),
-    [("real", 2), *(pytest.param(*x, marks=pytest.mark.slow) for x in (("go2", 5), ("spot", 8)))],
+    [("real", 2), *(pytest.param(*x, marks=pytest.mark.slow) for x in LYING)],
 )
 def test_a_robot_that_lies_stands_up_in_mujoco(name: str, seed: int, tmp_path: Path) -> None:
     """It drops from 0.3 m on random legs, lies, stands up, balances, and sinks when it damps."""

@@ -12,7 +12,7 @@ from mjx_balance.cli.common import complain
 from mjx_balance.errors import PATH, how_to_install, shorten
 from mjx_balance.evaluation.rollout import policy_scene
 from mjx_balance.policy.c_header import export_header
-from mjx_balance.policy.file import convert_policy, find_policy, load_policy, read_policy
+from mjx_balance.policy.file import convert_policy, find_policy, read_policy
 from mjx_balance.policy.manifest import FORMAT_VERSION, naming, upgrade
 from mjx_balance.policy.network import Policy
 
@@ -31,30 +31,50 @@ class ExportArgs:
     trim: bool = False
     """Measure in simulation how far the servos must aim beyond their targets to bear the robot, so
     that a runtime knows feed-forward torques; a trained policy has that already."""
+    stateful: bool = False
+    """Write the controller as ONNX: from a sample of the sensors and its state to joint targets and
+    the next state. Without it an ONNX model is the network: from observations to commands."""
 
 
 def export(argv: list[str]) -> int:
     args = tyro.cli(ExportArgs, args=argv, prog="mjx-balance export")
     writers = {".onnx": _write_onnx, ".h": _write_header, ".safetensors": _write_safetensors}
     if args.out.suffix not in writers:
-        return complain(f"out is {args.out}; its name must end in .onnx, .h or .safetensors")
+        out = shorten(args.out, PATH)
+        return complain(f"out is {out}; its name must end in .onnx, .h or .safetensors")
+    if args.stateful and args.out.suffix != ".onnx":
+        return complain(
+            f"stateful is set, but out is {shorten(args.out, PATH)}; only a model in .onnx can be "
+            "stateful"
+        )
     return writers[args.out.suffix](args)
 
 
 def _write_onnx(args: ExportArgs) -> int:
     try:
         from mjx_balance.policy.onnx import OPSET, export_onnx
+        from mjx_balance.policy.onnx_controller import export_controller
     except ImportError as error:
         return complain(f"export needs the package onnx ({error}); {how_to_install('onnx')}")
-    policy = load_policy(args.policy)
-    if args.action is not None:
-        policy = policy.with_action(args.action)
-    size = export_onnx(policy, args.out)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy"
+        policy = _convert(args, path)
+        if args.stateful:
+            size, values = export_controller(path, args.out)
+            legs = len(policy.manifest["robot"]["legs"])
+            about = (
+                f"joint_positions ({legs}, 3), gyro (3,), accelerometer (3,), state ({values},) "
+                f"float64 -> targets ({legs}, 3), command (2,) float64, decided () bool, "
+                f"next_state ({values},) float64"
+            )
+        else:
+            size = export_onnx(policy, args.out)
+            about = (
+                f"observation (N, {policy.observation_size}) float32 -> q_values "
+                f"(N, {len(policy.actions)}) float32, action (N,) int64, command (N, 2) float32"
+            )
     print(f"{shorten(args.out, PATH)}: {size / 1000:,.1f} kB, opset {OPSET}")
-    print(
-        f"observation (N, {policy.observation_size}) float32 -> "
-        f"q_values (N, {len(policy.actions)}) float32, action (N,) int64, command (N, 2) float32"
-    )
+    print(about)
     return 0
 
 

@@ -101,7 +101,7 @@ class BalanceEnv(Env):
         """Starts a fresh tilt scenario from the settled stance, by a PRNG key."""
         task, robot, scene = self.config.task, self.scene.robot, self.scene
         ranges, params, pushes = self.config.randomization, None, None
-        errors, event = None, None
+        errors = None
         # No key depends on how many are split off: pushes change no other draw.
         rng, key_params, key_noise, key_pushes, key_errors, key_event = jax.random.split(rng, 6)
         info = {
@@ -115,9 +115,10 @@ class BalanceEnv(Env):
         if ranges.sensors_err:
             draws = jax.random.uniform(key_errors, (count_draws(robot),), jnp.float32)
             errors = draw_errors(ranges, robot, draws)
-        if ranges.happens and params is not None:
-            draws = jax.random.uniform(key_event, (events.DRAWS,), jnp.float32)
-            event = events.draw_event(ranges, robot, params, task.episode_length, draws)
+        event = events.sample_event(
+            *(ranges, robot, params, task.episode_length),
+            lambda count: jax.random.uniform(key_event, (count,), jnp.float32),
+        )
         due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
         if len(due):
             draws = jax.random.uniform(key_pushes, (len(due), 2), jnp.float32)

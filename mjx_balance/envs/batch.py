@@ -52,7 +52,7 @@ def draw_episodes(
       rngs: of each episode; the noise of its sensors comes from it, too.
     """
     due = push_decisions(task, ranges, task.episode_length * task.ctrl_dt)
-    params, pushes, errors, event = None, None, None, None
+    params, pushes, errors = None, None, None
     scenarios = [draw_scenario(task, numpy_uniform(rng)) for rng in rngs]
     if ranges.varies:
         count = param_draws(ranges)
@@ -63,9 +63,10 @@ def draw_episodes(
     if ranges.sensors_err:
         count = count_draws(robot)
         errors = draw_errors(ranges, robot, np.stack([rng.uniform(size=count) for rng in rngs]))
-    if ranges.happens and params is not None:
-        uniform = np.stack([rng.uniform(size=events.DRAWS) for rng in rngs])
-        event = events.draw_event(ranges, robot, params, task.episode_length, uniform)
+    event = events.sample_event(
+        *(ranges, robot, params, task.episode_length),
+        lambda count: np.stack([rng.uniform(size=count) for rng in rngs]),
+    )
     return Episodes(stacked(scenarios), params, pushes, rngs, errors, event)
 
 

@@ -157,11 +157,11 @@ def draw_suite(
         numbers = np.asarray([rng.uniform(size=count_draws(robot)) for rng in own])
         errors = draw_errors(ranges, robot, numbers)
     params = draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None
-    event = None
-    if ranges.happens and params is not None:
-        own = [np.random.default_rng((seed, k, 6)) for k in range(scenarios)]
-        numbers = np.asarray([rng.uniform(size=events.DRAWS) for rng in own])
-        event = events.draw_event(ranges, robot, params, round(duration / task.ctrl_dt), numbers)
+    own = (np.random.default_rng((seed, k, 6)) for k in range(scenarios))
+    event = events.sample_event(
+        *(ranges, robot, params, round(duration / task.ctrl_dt)),
+        lambda count: np.asarray([rng.uniform(size=count) for rng in own]),
+    )
     scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
     if chosen.motion is not None:
         draw = tilt.MOTIONS[chosen.motion]

@@ -3,6 +3,7 @@
 A load is laid on the trunk or slides, a foot gets onto a slippery patch, a servo weakens.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float, Int
 from mjx_balance.config import RandomizationConfig
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.task import Array
-from mjx_balance.task.randomization import DomainParams
+from mjx_balance.task.randomization import DomainParams, load_place
 
 DRAWS = 8  #: uniform random numbers that the event of one env takes
 BETWEEN = 0.2, 0.6  #: shares of an episode between which it happens (chosen)
@@ -25,6 +26,22 @@ class Event(NamedTuple):
     payload_at: Float[Array, "*batch 3"]  #: where, in the trunk's frame, m
     grip: Float[Array, "*batch legs"]  #: factor on the sliding friction of every foot
     strength: Float[Array, "*batch legs 3"]  #: factor on the position gain of every leg servo
+
+
+def sample_event(
+    ranges: RandomizationConfig,
+    robot: Robot,
+    params: DomainParams | None,
+    decisions: int,
+    uniform: Callable[[int], Array],
+) -> Event | None:
+    """`draw_event`, or None if nothing happens or no parameters are random.
+
+    `uniform` returns so many random numbers in [0, 1) for every env; only an event calls it.
+    """
+    if params is None or not ranges.happens:
+        return None
+    return draw_event(ranges, robot, params, decisions, uniform(DRAWS))
 
 
 def draw_event(
@@ -47,14 +64,12 @@ def draw_event(
         return xp.where(hit, (least + (1 - least) * size)[..., None], 1.0).astype(uniform.dtype)
 
     first, last = BETWEEN
-    offset = ranges.payload_offset
-    at = offset * (2 * u[2] - 1), offset * (2 * u[3] - 1), 0 * u[0] + ranges.payload_height
     loaded = ranges.event_payload > 0
     strength = one_of(3 * legs, u[6], ranges.event_strength, u[7])
     return Event(
         due=xp.ceil(decisions * (first + (last - first) * u[0])).astype(int),
         payload=ranges.event_payload * u[1] if loaded else params.payload,
-        payload_at=xp.stack(at, axis=-1) if loaded else params.payload_at,
+        payload_at=load_place(ranges, u[2], u[3]) if loaded else params.payload_at,
         grip=one_of(legs, u[4], ranges.event_grip, u[5]),
         strength=xp.reshape(strength, (*strength.shape[:-1], legs, 3)),
     )

@@ -29,6 +29,15 @@ def param_draws(ranges: RandomizationConfig) -> int:
     return DRAWS + (ranges.soft_share > 0)
 
 
+def load_place(
+    ranges: RandomizationConfig, x: Float[Array, "*batch"], y: Float[Array, "*batch"]
+) -> Float[Array, "*batch 3"]:
+    """Where a load lies, in the trunk's frame, m, for two random numbers in [0, 1)."""
+    xp, offset = x.__array_namespace__(), ranges.payload_offset
+    at = offset * (2 * x - 1), offset * (2 * y - 1), 0 * x + ranges.payload_height
+    return xp.stack(at, axis=-1)
+
+
 def draw_params(
     ranges: RandomizationConfig, robot: Robot, uniform: Float[Array, "*batch draws"]
 ) -> DomainParams:
@@ -36,15 +45,13 @@ def draw_params(
     xp = uniform.__array_namespace__()
     u = xp.moveaxis(uniform, -1, 0)
     sigma = np.asarray([ranges.gyro_noise] * 3 + [ranges.accel_noise] * 3, uniform.dtype)
-    offset = ranges.payload_offset
-    at = offset * (2 * u[1] - 1), offset * (2 * u[2] - 1), 0 * u[0] + ranges.payload_height
     friction_min = robot.foot_friction if ranges.friction_min is None else ranges.friction_min
     friction_max = robot.foot_friction if ranges.friction_max is None else ranges.friction_max
     legs, share = np.ones(len(robot.legs), uniform.dtype), ranges.soft_share
     return DomainParams(
         imu_noise=xp.zeros_like(u[0])[..., None] + sigma,
         payload=ranges.payload * u[0],
-        payload_at=xp.stack(at, axis=-1),
+        payload_at=load_place(ranges, u[1], u[2]),
         friction=(friction_min + (friction_max - friction_min) * u[3])[..., None] * legs,
         gain=(1 + ranges.gain_spread * (2 * u[4] - 1))[..., None, None]
         * legs[:, None]

@@ -75,7 +75,7 @@ def pack(parts: Parts, rng: random.Random) -> bytes:
 def assert_moves_within_reach(controller: Controller, rng: random.Random) -> None:
     """Whatever the network says, no target is further than a turn of the leg from the zeros."""
     noise = np.random.default_rng(rng.randrange(2**32))
-    low, high = controller._legs.limits()
+    low, high = controller.model.legs.limits()
     for _ in range(2 * controller.decision_samples + 2 if controller.decision_samples < 99 else 2):
         samples = noise.normal((0, 0, 0, 0, 0, 9.81), 0.02)
         targets = controller.step(controller.targets, samples[:3], samples[3:]).ravel()

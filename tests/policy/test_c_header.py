@@ -18,15 +18,15 @@ from fixtures.headers import (
     compiler,
     sample_row,
 )
-from fixtures.policies import random_policy, rewrite, with_head
+from fixtures.policies import LAYOUTS, random_policy, rewrite, with_head
+from fixtures.streams import evaluation_samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjx_balance.cli import main
 from mjx_balance.config import Config
-from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
 from mjx_balance.policy.c_header import c_string, export_header
-from mjx_balance.policy.file import load_policy, shipped_policies
+from mjx_balance.policy.file import shipped_policies
 from mjx_balance.runtime import RESPONSES, Controller, Fault, State
 
 SHIPPED = shipped_policies()
@@ -73,7 +73,7 @@ class Pair:
         assert (np.abs(c.targets - python._targets) <= self.agree).all()
         if python.command is not None:
             assert (np.abs(c.command - python.command) <= 1e-8).all()
-        if python._gains is not None:
+        if python.model.gains is not None:
             torque = 0.0 if python.torque is None else python.torque
             for own, expected in zip(
                 c.gains, (python.stiffness, python.damping, torque), strict=True
@@ -83,30 +83,17 @@ class Pair:
 
 def compare_evaluation(name: str, library: Any, suite: str, count: int, seconds: float) -> int:
     """Feeds an evaluation's samples to both; returns the number of decisions."""
-    path = SHIPPED[name]
-    policy = load_policy(path)
-    scene, imu = policy_scene(policy), []
-
-    def controller(view: Any) -> np.ndarray:
-        imu.append(view.imu)
-        return observing(policy)(view)
-
-    rollout = run_suite(scene, controller, suite, count, seconds, 5, record=True)
-    assert rollout.qpos is not None
     now = 0.0
-    decisions, python = 0, Controller(path, lambda: now)
-    for k in range(count):
-        imu_k = np.concatenate([x[k] for x in imu])[scene.task.sim_steps - 1 :].astype(np.float32)
-        joints = np.concatenate((scene.stance.qpos[None], rollout.qpos[k]))[:, scene.leg_qpos]
-        samples = list(zip(imu_k, joints.astype(np.float32), strict=False))
+    decisions, python = 0, Controller(SHIPPED[name], lambda: now)
+    for samples in evaluation_samples(SHIPPED[name], suite, count, seconds):
         expected, rows = [], []
         python.reset()
-        for sample, angles in samples:
+        for joints, gyro, accelerometer in samples:
             now += python.sample_dt
-            targets = python.step(angles, sample[:3], sample[3:])
+            targets = python.step(joints, gyro, accelerometer)
             state = STATES.index(python.state)
             expected.append((state, int(python.fault), python.action, *targets.ravel()))
-            rows.append(sample_row(angles, sample[:3], sample[3:], now))
+            rows.append(sample_row(joints, gyro, accelerometer, now))
         outputs = CController(library, 4).run(np.stack(rows))
         expected = np.asarray(expected, float)
         np.testing.assert_array_equal(outputs[:, [0, 1, 4]], expected[:, :3])
@@ -133,17 +120,6 @@ def test_it_decides_as_the_runtime_with_every_policy(
     for suite in ("corner", "push", "noise"):
         decisions += compare_evaluation(name, build_shipped(SHIPPED[name]), suite, scenarios, 60.0)
     assert decisions >= 890 * scenarios
-
-
-LAYOUTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "joint": ("joint", {"action_levels": 5}),
-    "factored": ("factored", {"command_lags": (0, 3), "action_ramp": 1.0}),
-    "radial": ("radial", {"gyro_lags": (0, 120), "accel_lags": (7, 3), "imu_mean": 4}),
-    "rates": ("radial", {"ctrl_dt": 0.05, "sim_dt": 0.005, "action_ramp": 0.01, "imu_mean": 2}),
-    "long memory": ("radial", {"mean_times": (0.5, 30.0), "filter_times": (4.0, 0.3)}),
-    "off the grid": ("radial", {"action": "continuous", "command_lags": (0, 1)}),
-    "every sample": ("radial", {"ctrl_dt": 0.004, "action_ramp": 0.5}),
-}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -246,8 +222,10 @@ def test_it_does_what_the_runtime_does_whatever_happens(
         if gains:
             play(pair, "still", 1, 0)
         pair.act("stand")
-        low, high = pair.python._legs.limits()
-        pose = low + np.random.default_rng(len(segments)).random(12) * (high - low)
+        low, high = pair.python.model.legs.limits()
+        beyond = np.tile((0.0, 0.0, 0.25), 4)
+        shares = np.random.default_rng(len(segments)).random(12)
+        pose = low - beyond + shares * (high - low + 2 * beyond)
         pair.step(pose.reshape(4, 3), [0, 0, 0], [0, 0, 9.81])
         play(pair, "still", 260 if len(segments) % 2 else 900 * calls, 1)
     for segment in segments:

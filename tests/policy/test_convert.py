@@ -89,6 +89,39 @@ def test_a_policy_of_todays_format_is_copied(tmp_path: Path) -> None:
     assert out.read_bytes() == BEST.read_bytes()
 
 
+OUTS = [("p.safetensors",), ("p.h",), ("p.onnx",), ("p.onnx", "--stateful")]
+
+
+@pytest.mark.parametrize("out", OUTS, ids=" ".join)
+def test_an_old_policy_becomes_what_its_copy_of_today_becomes(
+    old: Path, out: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(old.parent)
+    assert main(["export", "old.safetensors", "--out", "new.safetensors"]) == 0
+    contents = []
+    for policy in ("old.safetensors", "new.safetensors"):
+        assert main(["export", policy, "--out", *out]) == 0
+        contents.append(Path(out[0]).read_bytes())
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize("out", OUTS, ids=" ".join)
+@pytest.mark.parametrize("version", [3, 6])
+def test_a_policy_of_another_format_is_refused_for_every_kind_of_file(
+    old: Path,
+    version: int,
+    out: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rewrite(old, lambda w, m: m.update(version=version))
+    monkeypatch.chdir(old.parent)
+    assert main(["export", "old.safetensors", "--out", *out]) == 2
+    message = f"old.safetensors cannot be used: version is {version}; this release reads 5\n"
+    assert capsys.readouterr().err == f"mjx-balance: {message}"
+    assert not Path(out[0]).exists()
+
+
 @pytest.mark.parametrize(
     ("part", "value", "message"),
     [

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fixtures.arrays import put
 
 from mjx_balance.config import Config, TaskConfig
 from mjx_balance.robots.catalogue import Robot
@@ -76,11 +77,6 @@ def before(
         params = DomainParams(*[np.zeros(len(env_steps))] * 7)._replace(delay=np.asarray(delay))
     memory = random_memory() if memory is None else memory
     return step.EnvState(np.zeros(()), memory, scenario, np.asarray(env_steps), params, None)
-
-
-def put(xp: types.ModuleType, tree: Any) -> Any:
-    """Arrays of the library, its own float."""
-    return jax.tree.map(lambda x: xp.asarray(x, int if x.dtype == int else float), tree)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from fixtures.arrays import put
 
 from mjx_balance import BalanceEnv
 from mjx_balance.config import Config, RandomizationConfig
@@ -34,11 +35,6 @@ BEFORE = DomainParams(
     delay=np.zeros(2),
     softness=np.zeros(2),
 )
-
-
-def put(xp: types.ModuleType, tree: Any) -> Any:
-    """Arrays of the library, its own float."""
-    return jax.tree.map(lambda x: xp.asarray(x, int if x.dtype == int else float), tree)
 
 
 def test_every_draw_lands_in_its_own_field(

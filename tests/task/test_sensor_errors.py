@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fixtures.arrays import put
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import RandomizationConfig, TaskConfig
@@ -68,11 +69,6 @@ def nominal() -> DomainParams:
     zero, friction, gain = np.zeros(N), np.full((N, 4), 0.8), np.ones((N, 4, 3))
     noise = np.tile((0.001, 0.002, 0.003, 0.01, 0.02, 0.03), (N, 1))
     return DomainParams(noise, zero, np.zeros((N, 3)), friction, gain, zero, zero)
-
-
-def put(xp: types.ModuleType, tree: Any) -> Any:
-    """Arrays of the library, its own float."""
-    return jax.tree.map(lambda x: xp.asarray(x, int if x.dtype == int else float), tree)
 
 
 def test_every_draw_lands_in_its_own_field(
