@@ -7,6 +7,13 @@ const DEGREES = 180 / Math.PI;
 
 /** Moves the legs by what `choose` says at every decision. */
 class Baseline {
+  state = STANDING;
+  reason = "";
+  number = 0;
+  targets = new Float64Array(0);
+  heights = new Float64Array(0);
+  before = new Float64Array(0);
+
   /** @param {any} data of the robot */
   constructor(data) {
     this.legs = new Legs(data.robot);

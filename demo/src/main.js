@@ -41,7 +41,6 @@ const SUITES = {
   slip: "As paper; a foot gets onto a slippery patch.",
   weak: "As paper; a servo weakens.",
 };
-const FRAME = 1 / 60; // s
 const MOST_FRAME = 0.1; // s of simulation per frame: a slow device shows slow motion
 const PLOT_EVERY = 0.04; // s between two samples of the plots
 const SCENARIO_SECONDS = 60;
@@ -106,6 +105,8 @@ class Page {
     /** Where the disc is, right and away, deg. */
     this.pull = [0, 0];
     this.busy = false;
+    /** File and key of the scene that is shown. */
+    this.scene = "";
     this.due = 0;
     this.speed = 1;
     this.before = 0;
@@ -203,7 +204,7 @@ class Page {
     element("about", HTMLElement).textContent = SUITES[/** @type {keyof typeof SUITES} */ (suite)] ?? "";
     element("evaluate", HTMLButtonElement).disabled = suite === BY_HAND;
     element("source", HTMLElement).textContent = about.source
-      ? `The model of ${about.name}, simplified for drawing, is from ${about.source}; its licence: ${about.license}.`
+      ? `The model of ${about.name}, simplified for drawing, is from ${about.source}, under ${about.license}.`
       : "";
     this.restart(scenario);
     this.busy = false;
@@ -258,7 +259,7 @@ class Page {
 
   /** Kicks the robot in any direction. */
   kick() {
-    const speed = Number(element("kick-size", HTMLInputElement).value) * (this.data.task.push_scale ?? 1);
+    const speed = Number(element("kick-size", HTMLInputElement).value) * this.data.task.push_scale;
     const angle = 2 * Math.PI * Math.random();
     this.physics?.push([speed * Math.cos(angle), speed * Math.sin(angle)]);
   }
@@ -277,12 +278,12 @@ class Page {
 
   /** Runs what is due since the last frame, and draws. @param {number} now ms */
   frame(now) {
-    const passed = Math.min((now - this.before) / 1000, 1);
+    const passed = Math.max((now - this.before) / 1000, 1e-3);
     this.before = now;
     const { simulation, physics, view } = this;
     if (simulation && physics && !this.busy) {
       const wanted = Math.min(passed, MOST_FRAME);
-      this.speed += 0.02 * (wanted / Math.max(passed, FRAME / 4) - this.speed);
+      this.speed += Math.min(passed, 1) * (wanted / passed - this.speed);
       for (this.due += wanted; this.due >= this.data.task.sim_dt; this.due -= this.data.task.sim_dt) {
         this.step(simulation, physics);
       }
@@ -291,7 +292,9 @@ class Page {
       this.boardPlot.draw();
       view?.update(physics);
     }
-    view?.draw();
+    if (!this.busy) {
+      view?.draw();
+    }
     requestAnimationFrame((next) => this.frame(next));
   }
 

@@ -2,6 +2,11 @@
 
 /** @typedef {import("@mujoco/mujoco").MainModule} MuJoCo */
 
+/** Arrays in WebAssembly's memory. @param {any} data @returns {Record<string, Float64Array>} */
+function views({ qpos, qvel, ctrl, sensordata, xpos, xquat }) {
+  return { qpos, qvel, ctrl, sensordata, xpos, xquat };
+}
+
 /** A scene of a robot's data, simulated. */
 export class Physics {
   /**
@@ -21,20 +26,14 @@ export class Physics {
     this.setFields(scene.fields);
     /** Numbers of the nominal model, of fields that scenarios change. @type {Map<string, Float64Array>} */
     this.nominal = new Map();
-    this.findViews();
+    this.views = views(this.data);
     this.reset();
-  }
-
-  /** Views into WebAssembly's memory; a memory that grows has new ones. */
-  findViews() {
-    const { qpos, qvel, ctrl, sensordata, xpos, xquat } = this.data;
-    this.views = { qpos, qvel, ctrl, sensordata, xpos, xquat };
   }
 
   /** The state, as arrays to read and write. */
   get state() {
     if (this.views.qpos.length === 0) {
-      this.findViews();
+      this.views = views(this.data); // WebAssembly's memory has grown, and moved
     }
     return this.views;
   }

@@ -31,6 +31,25 @@ class Unsafe extends Error {}
 
 /** A controller; decides at the first sample and then every `decisionSamples` samples. */
 export class Controller {
+  state = STANDING;
+  reason = "";
+  /** Index of the last action, or of the nearest on the grid. @type {number | null} */
+  action = null;
+  /** Its height changes a_x and a_y, m. @type {number[] | null} */
+  command = null;
+  /** Joint targets until the next sample, (3 legs,), rad. @type {Float64Array} */
+  targets = new Float64Array(0);
+  /** Those of the present decision's ramp. @type {Float64Array[]} */
+  path = [];
+  /** Samples since the last decision, since the first, and decisions in a row after a gap. */
+  since = 0;
+  seen = 0;
+  gaps = 0;
+  /** Joints at the decisions of the time that is checked for repetitions. @type {Float64Array[]} */
+  poses = [];
+  /** Targets at which each joint's reading changed last. @type {Float64Array} */
+  there = new Float64Array(0);
+
   /**
    * @param {import("./policy.js").Policy} policy
    * @throws {PolicyError} if it is none that this file can run
@@ -78,9 +97,7 @@ export class Controller {
   reset() {
     this.state = STANDING;
     this.reason = "";
-    /** Index of the last action, or of the nearest on the grid. @type {number | null} */
     this.action = null;
-    /** Its height changes a_x and a_y, m. @type {number[] | null} */
     this.command = null;
     this.commands.fill(this.height);
     const standing = this.legs.jointAngles(this.commands.slice(-this.legs.count));
@@ -89,7 +106,6 @@ export class Controller {
     this.since = 0;
     this.seen = 0;
     this.gaps = 0;
-    /** Joints at the decisions of the time that is checked for repetitions. @type {Float64Array[]} */
     this.poses = [];
     this.there = standing;
   }
@@ -359,6 +375,7 @@ class Means {
    * @param {number} sampleDt
    */
   constructor(rows, sampleDt) {
+    /** @type {Record<string, number>} */
     const first = { gyro: 0, accelerometer: 3, angle: IMU };
     this.rows = rows.map((row) => {
       if (!(row.sensor in first)) {
@@ -371,7 +388,7 @@ class Means {
       const leak = sampleDt / (tau + sampleDt);
       const start = 1 - (1 - leak) ** Math.round(LIMITS.STANDING_S / sampleDt);
       const angle = row.sensor === "angle";
-      const place = first[/** @type {keyof first} */ (row.sensor)] + row.index;
+      const place = first[row.sensor] + row.index;
       return { place, angle, index: row.index, tau, leak, start: angle ? 1 : start };
     });
     this.sum = new Float64Array(rows.length);
@@ -514,7 +531,8 @@ class Network {
       const name = k < hidden.length ? `hidden_${k}` : "head";
       const kernel = weights.get(`${name}/kernel`);
       const bias = weights.get(`${name}/bias`);
-      if (`${kernel?.shape} ${bias?.shape}` !== `${n},${columns[k]} ${columns[k]}`) {
+      const fits = `${kernel?.shape} ${bias?.shape}` === `${n},${columns[k]} ${columns[k]}`;
+      if (!kernel || !bias || !fits) {
         throw new PolicyError(`weight ${name} is missing or not of shape ${n} x ${columns[k]}`);
       }
       return { kernel: kernel.values, bias: bias.values };

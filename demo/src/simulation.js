@@ -15,6 +15,24 @@ const NOTHING = {};
 
 /** Physics, sensors, controller and board; after `reset`, `step` by `step`. */
 export class Simulation {
+  /** Number of physics steps since the start. */
+  steps = 0;
+  /** The body's, deg. */
+  tilt = 0;
+  /** Time of the fall, s. @type {number | null} */
+  fellAt = null;
+  /** Where `aim` leads, and where the board's servos are on the way, deg. */
+  aim = [0, 0];
+  way = [0, 0];
+  /** Where a platform rests, m. @type {number[]} */
+  platform = [];
+  /** Physics steps from a command to the servos. */
+  delay = 0;
+  /** Targets that the servos have yet to obey, the newest last. @type {Float64Array[]} */
+  targets = [];
+  /** What the robot got last: gyro, rad/s, and accelerometer, m/s^2. @type {number[]} */
+  imu = [];
+
   /**
    * @param {import("./physics.js").Physics} physics
    * @param {any} data of the robot
@@ -25,6 +43,9 @@ export class Simulation {
     this.task = data.task;
     this.balancer = balancer;
     this.standing = new Legs(data.robot);
+    /** @type {any} */
+    this.scenario = NOTHING;
+    this.sensors = new Sensors(this.task, NOTHING, 0);
     this.reset();
   }
 
@@ -42,20 +63,13 @@ export class Simulation {
     this.balancer.reset();
     this.sensors = new Sensors(this.task, scenario, seed);
     this.imu = this.sensors.start(scenario.imu ?? this.physics.scene.imu);
-    /** Number of physics steps since the start. */
     this.steps = 0;
-    /** Where `aim` leads, and where the board's servos are on the way, deg. */
-    this.aim = [0, 0];
-    this.way = [0, 0];
-    /** Where a platform rests, m. @type {number[]} */
+    this.aim = this.way = [0, 0];
     this.platform = [];
     const { count } = this.standing;
     const heights = new Float64Array(count).fill(this.task.body_height);
-    const delay = this.task.command_delay + (scenario.delay ? this.task.sim_steps : 0);
-    this.delay = delay;
-    /** Targets that the servos have yet to obey, the newest last. @type {Float64Array[]} */
+    this.delay = this.task.command_delay + (scenario.delay ? this.task.sim_steps : 0);
     this.targets = Array(2 * this.task.sim_steps).fill(this.standing.jointAngles(heights));
-    /** Greatest tilt is a fall; the time of the first one, s, or null. @type {number | null} */
     this.fellAt = null;
     this.tilt = this.physics.tilt;
   }

@@ -33,6 +33,7 @@ from mjx_balance.policy.file import convert_policy, find_policy, load_policy, sh
 from mjx_balance.policy.manifest import PolicyError
 from mjx_balance.robots.catalogue import robot_file
 from mjx_balance.robots.limits import delay_steps, greatest_incline
+from mjx_balance.robots.model import model_path
 from mjx_balance.sim.domain_randomization import randomized_fields
 from mjx_balance.sim.scene import BOARD, ROBOT, Scene, build_spec
 from mjx_balance.task.events import params_now
@@ -91,7 +92,7 @@ def robot_data(scene: Scene, seed: int = 0, suites: Iterable[str] = SUITES) -> d
             "max_incline": greatest_incline(task, robot),
             "body_height": task.body_height,
             "command_delay": delay_steps(task, robot),
-            "push_speed": 0.4 * robot.push_scale,
+            "push_scale": robot.push_scale,
         },
         "pd": {
             "gain": pd.gain.tolist(),
@@ -250,13 +251,21 @@ def write_data(folder: Path, shown: Iterable[tuple[Path | None, Scene]], seed: i
         # Policies of one robot may have other tasks.
         file = f"{content['name']}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
         (data / file).write_text(text, encoding="utf-8")
-        about = {name: content[name] for name in ("name", "source", "license")}
-        index["robots"][file] = about
+        index["robots"][file] = {key: content[key] for key in ("name", "source", "license")}
+        _copy_license(data, scene.robot_source)
         if path is not None:
             name = path.stem
             shutil.copyfile(path, data / f"{name}.safetensors")
             index["policies"].append({"name": name, "file": f"{name}.safetensors", "robot": file})
     (data / "index.json").write_text(json.dumps(index, indent=1), encoding="utf-8")
+
+
+def _copy_license(data: Path, robot: str) -> None:
+    """Copies the licence that lies beside a maker's model, which asks to go along with it."""
+    file = robot_file(robot)
+    text = model_path(file.model, file.folder).parent / "LICENSE"
+    if text.is_file():
+        shutil.copyfile(text, data / f"LICENSE-{file.name}.txt")
 
 
 def shipped_scenes() -> Iterable[tuple[Path, Scene]]:
