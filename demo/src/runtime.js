@@ -632,5 +632,5 @@ function changed(rows, start, end) {
 
 /** A number with few digits, as Python's `:.3g`. @param {number} x @param {number} digits */
 function short(x, digits = 3) {
-  return String(Number(x.toPrecision(digits)));
+  return String(Number(x.toPrecision(digits))).toLowerCase(); // nan
 }
