@@ -26,7 +26,7 @@ const SUITES = {
   gains: "As paper, with servo gains off by up to 20%.",
   soft: "As paper, on soft servos.",
   latency: "As paper, but the legs obey one decision (0.2 s) late.",
-  push: "As paper, with a kick every 5 s.",
+  push: "As paper, with a push every 5 s.",
   fast: "As paper, with a faster board.",
   steep: "As paper, with a steeper board.",
   recover: "Board and body start tilted.",
@@ -257,9 +257,9 @@ class Page {
     this.knob.style.top = `${50 - y}%`;
   }
 
-  /** Kicks the robot in any direction. */
-  kick() {
-    const speed = Number(element("kick-size", HTMLInputElement).value) * this.data.task.push_scale;
+  /** Pushes the robot in any direction. */
+  push() {
+    const speed = Number(element("push-size", HTMLInputElement).value) * this.data.task.push_scale;
     const angle = 2 * Math.PI * Math.random();
     this.physics?.push([speed * Math.cos(angle), speed * Math.sin(angle)]);
   }
@@ -376,13 +376,13 @@ class Page {
     this.suite.onchange = guard(() => this.choose());
     this.scenario.onchange = () => this.restart();
     element("controls", HTMLFormElement).onsubmit = (event) => event.preventDefault();
-    element("kick", HTMLElement).onclick = () => this.kick();
+    element("push", HTMLElement).onclick = () => this.push();
     element("off", HTMLElement).onclick = () => this.switchOff();
     element("again", HTMLElement).onclick = () => this.restart();
     element("evaluate", HTMLElement).onclick = guard(() => this.evaluate());
-    const size = element("kick-size", HTMLInputElement);
+    const size = element("push-size", HTMLInputElement);
     size.oninput = () => {
-      element("kick-speed", HTMLOutputElement).value = Number(size.value).toFixed(1);
+      element("push-speed", HTMLOutputElement).value = Number(size.value).toFixed(1);
     };
     this.pad.onpointerdown = (event) => {
       this.pad.setPointerCapture(event.pointerId);
@@ -422,8 +422,8 @@ class Page {
     const move = moves[/** @type {keyof typeof moves} */ (event.key)];
     /** @type {Record<string, () => void>} */
     const keys = {
-      k: () => this.kick(),
-      p: () => this.switchOff(),
+      p: () => this.push(),
+      o: () => this.switchOff(),
       r: () => this.restart(),
       Home: () => this.tiltBy([0, 0]),
     };

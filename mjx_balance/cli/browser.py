@@ -305,7 +305,7 @@ def view_in_browser(args: ControllerArgs, suite: str | None, seed: int, port: in
     check_seed(seed)
     if args.controller not in (None, *BASELINES):
         raise InputError(
-            f"controller is {args.controller}; in a browser it must be {' or '.join(BASELINES)}"
+            f"controller is {args.controller!r}; in a browser it must be {' or '.join(BASELINES)}"
         )
     with tempfile.TemporaryDirectory() as name:
         folder, path = Path(name), None

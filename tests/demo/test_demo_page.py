@@ -4,7 +4,6 @@ import functools
 import gzip
 import http.server
 import json
-import shutil
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fixtures.chromium import Browser
-from fixtures.javascript import REPO, node
+from fixtures.javascript import REPO, install, node
 
 from mjx_balance.cli.browser import write_data
 from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
@@ -43,10 +42,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the page as the sources now make it, with the policies of our robot."""
     folder = tmp_path_factory.mktemp("page")
-    if not (REPO / "demo/node_modules/esbuild").is_dir():
-        if shutil.which("npm") is None:
-            pytest.skip("needs npm; Debian's package is npm")
-        subprocess.run(["npm", "--prefix", "demo", "ci", "--no-audit"], cwd=REPO, check=True)
+    install()
     subprocess.run([node(), REPO / "demo/build.js", folder], check=True)
     files = shipped_policies()
     shown = [(files[name], policy_scene(load_policy(files[name]))) for name in ("best", "real")]
@@ -134,8 +130,8 @@ def test_it_falls_without_a_policy(browser: Browser, address: str) -> None:
     assert found["tilt_deg"]["mean"] > 3
 
 
-def test_the_reader_tilts_kicks_and_switches_off(browser: Browser, address: str) -> None:
-    """The board goes where keys and disc say; a kick shows; off holds; a new start balances."""
+def test_the_reader_tilts_pushes_and_switches_off(browser: Browser, address: str) -> None:
+    """The board goes where keys and disc say; a push shows; off holds; a new start balances."""
     browser.open(f"{address}?suite=")
     browser.wait(READY)
     press = "dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowUp'}))"
@@ -144,8 +140,8 @@ def test_the_reader_tilts_kicks_and_switches_off(browser: Browser, address: str)
     browser.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'Home'}))")
     assert browser.run("document.getElementById('knob').style.top") == "50%"
     box = browser.run(
-        "(({x, y}) => ({x, y}))(document.getElementById('pad').scrollIntoView() ?? "
-        "document.getElementById('pad').getBoundingClientRect())"
+        "(pad => { pad.scrollIntoView(); const { x, y } = pad.getBoundingClientRect();"
+        "return { x, y }; })(document.getElementById('pad'))"
     )
     for kind, x in (("mousePressed", 76), ("mouseMoved", 110), ("mouseReleased", 110)):
         browser.call(
@@ -157,15 +153,15 @@ def test_the_reader_tilts_kicks_and_switches_off(browser: Browser, address: str)
             clickCount=1,
         )
     assert float(browser.run("document.getElementById('knob').style.left")[:-1]) > 60
-    browser.run("document.getElementById('kick').click()")
+    browser.run("document.getElementById('push').click()")
     browser.wait("parseFloat(document.getElementById('tilt').textContent) > 0.3")
     browser.run("document.getElementById('off').click()")
     browser.wait("document.getElementById('state').textContent.includes('holding: switched off')")
     browser.run("document.getElementById('off').click()")
     browser.wait(READY)
     assert browser.run("document.getElementById('knob').style.left") == "50%"
-    browser.run("document.getElementById('kick-size').value = 1.5")
-    browser.run("document.getElementById('kick').click(); document.getElementById('kick').click()")
+    browser.run("document.getElementById('push-size').value = 1.5")
+    browser.run("document.getElementById('push').click(); document.getElementById('push').click()")
     browser.wait("document.getElementById('state').textContent.includes('holding: the ')")
     assert browser.messages == []
 
