@@ -18,7 +18,7 @@ import tempfile
 import urllib.parse
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -41,6 +41,7 @@ from mjx_balance.task.randomization import DomainParams
 
 PAGE = Path(__file__).resolve().parents[1] / "page"
 """The built page: `demo/build.js` writes it."""
+TYPES = {".js": "text/javascript", ".wasm": "application/wasm"}
 BASELINES = ("pd-imu", "none")
 """Those that the page knows."""
 SCENARIOS, SECONDS = 8, 60.0
@@ -163,8 +164,10 @@ def _simplify_meshes(spec: mujoco.MjSpec) -> None:
 
     All vertices in a cube of a grid become one, their mean.
     """
-    model = spec.compile() if spec.meshes else None
-    for mesh in list(spec.meshes) if model is not None else ():
+    if not spec.meshes:
+        return
+    model = spec.compile()
+    for mesh in list(spec.meshes):
         k = model.mesh(mesh.name).id
         start, end = model.mesh_vertadr[k] + np.asarray((0, model.mesh_vertnum[k]))
         vertices = model.mesh_vert[start:end].astype(float)
@@ -333,14 +336,10 @@ def view_in_browser(args: ControllerArgs, suite: str | None, seed: int, port: in
 class _Handler(http.server.SimpleHTTPRequestHandler):
     """Serves the page, and `/data/` from another folder."""
 
-    extensions_map: ClassVar = {
-        **http.server.SimpleHTTPRequestHandler.extensions_map,
-        ".js": "text/javascript",
-        ".wasm": "application/wasm",
-    }
-
     def __init__(self, page: Path, data: Path, *arguments: Any) -> None:
         self._data = data
+        # Python's own table asks the machine for these.
+        self.extensions_map = self.extensions_map | TYPES
         super().__init__(*arguments, directory=str(page))
 
     def translate_path(self, path: str) -> str:

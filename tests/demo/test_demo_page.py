@@ -15,7 +15,7 @@ import pytest
 from fixtures.chromium import Browser
 from fixtures.javascript import REPO, install, node
 
-from mjx_balance.cli.browser import write_data
+from mjx_balance.cli.browser import TYPES, write_data
 from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
 from mjx_balance.policy.file import load_policy, shipped_policies
 
@@ -28,11 +28,9 @@ RESULT = "document.getElementById('result')?.textContent"
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    extensions_map = {  # noqa: RUF012
-        **http.server.SimpleHTTPRequestHandler.extensions_map,
-        ".js": "text/javascript",
-        ".wasm": "application/wasm",
-    }
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        self.extensions_map = self.extensions_map | TYPES
+        super().__init__(*arguments, **keywords)
 
     def log_message(self, format: str, *args: Any) -> None:
         pass
