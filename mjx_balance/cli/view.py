@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import tyro
 
+from mjx_balance.cli.browser import view_in_browser
 from mjx_balance.cli.common import ControllerArgs, complain
 from mjx_balance.envs.batch import BatchEnv, Episodes
 from mjx_balance.evaluation.controllers import Controller
@@ -36,10 +37,16 @@ class ViewArgs(ControllerArgs):
     """Suite that moves the board and pushes the robot; none: keys do."""
     seed: int = 0
     """Seed of the suite's scenarios, and of the direction of pushes by key."""
+    browser: bool = False
+    """Serve a page for a browser instead, at 127.0.0.1; no display is needed here."""
+    port: int = 0
+    """Port of the page; 0: a free one."""
 
 
 def view(argv: list[str]) -> int:
     args = tyro.cli(ViewArgs, args=argv, prog="mjx-balance view")
+    if args.browser:
+        return view_in_browser(args, args.suite, args.seed, args.port)
     from mjx_balance.render import drawing as render
 
     scene, controller = args.load()
@@ -47,7 +54,9 @@ def view(argv: list[str]) -> int:
     try:
         window = render.Window(session.scene, session.press)
     except render.RenderError as error:
-        return complain(f"{error}; `mjx-balance evaluate --video` needs no display")
+        return complain(
+            f"{error}; `mjx-balance evaluate --video` and `view --browser` need no display"
+        )
     above, below = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
     keys = "Enter: push" if args.suite else KEYS
     with contextlib.closing(window):

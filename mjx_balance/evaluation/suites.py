@@ -111,6 +111,12 @@ def check_seed(seed: int) -> None:
         raise SuiteError(f"seed is {seed}; it must not be negative")
 
 
+def check_suite(suite: str | None) -> None:
+    """Raises `SuiteError` for the name of no suite; None is no suite at all."""
+    if suite is not None and suite not in SUITES:
+        raise SuiteError(f"unknown suite {suite!r}; known suites: {', '.join(SUITES)}")
+
+
 def draw_suite(
     task: TaskConfig, robot: Robot, suite: str, scenarios: int, duration: float, seed: int
 ) -> Episodes:
@@ -125,8 +131,7 @@ def draw_suite(
       SuiteError: for an unknown suite, a negative seed, a suite that needs another scene
         (`rollout.suite_scene`), or a board that does not arrive before its next target.
     """
-    if suite not in SUITES:
-        raise SuiteError(f"unknown suite {suite!r}; known suites: {', '.join(SUITES)}")
+    check_suite(suite)
     check_seed(seed)
     chosen = SUITES[suite]
     if chosen.platform and not task.platform:

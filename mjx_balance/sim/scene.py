@@ -149,7 +149,12 @@ def _times(first: Sequence[Array], second: Sequence[Array]) -> list[Array]:
 
 
 def build_model(task: TaskConfig, robot_source: str, visual: bool = False) -> mujoco.MjModel:
-    """Assembles and compiles stage, board and robot.
+    """Compiles stage, board and robot; as `build_spec`."""
+    return build_spec(task, robot_source, visual).compile()
+
+
+def build_spec(task: TaskConfig, robot_source: str, visual: bool = False) -> mujoco.MjSpec:
+    """Assembles stage, board and robot.
 
     Args:
       task: time step and standing height.
@@ -186,7 +191,7 @@ def build_model(task: TaskConfig, robot_source: str, visual: bool = False) -> mu
     if not visual:
         for geom in [g for g in stage.geoms if g.group == VISUAL_GROUP]:
             stage.delete(geom)
-    return stage.compile()
+    return stage
 
 
 def _platform(stage: mujoco.MjSpec, robot: Robot) -> mujoco.MjsBody:

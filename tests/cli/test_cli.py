@@ -227,7 +227,7 @@ def test_what_cannot_be_resumed_is_refused(
         ("view nobody", "no policy file at nobody; `mjx-balance train` writes one, and best"),
         ("view best --suite moon", "unknown suite 'moon'"),
         ("view best --seed -1", "seed is -1; it must not be negative"),
-        ("view best", "); `mjx-balance evaluate --video` needs no display"),
+        ("view best", "); `mjx-balance view --browser` and `evaluate --video` need no display"),
     ],
 )
 def test_impossible_commands_are_refused(
