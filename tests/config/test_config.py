@@ -276,7 +276,7 @@ def test_every_number_has_its_bounds_tested() -> None:
         ({"head": "round"}, "head is 'round'; it must be one of joint, factored, radial"),
         ({"export": "first"}, "export is 'first'; it must be one of last, best"),
         ({"export": "best", "eval_every": 0}, "export is 'best', but eval_every is 0"),
-        ({"preset": "papr"}, "'papr'; known presets: paper, default, best, real, quick, smoke"),
+        ({"preset": "papr"}, "'papr'; did you mean paper?"),
         (
             {"friction_min": 0.9, "friction_max": 0.8},
             "friction_max is 0.8; it must not be less than friction_min, 0.9",
