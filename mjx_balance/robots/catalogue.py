@@ -5,7 +5,9 @@
 
 import dataclasses
 import functools
+import json
 from pathlib import Path
+from typing import Any
 
 import mujoco
 
@@ -50,6 +52,11 @@ def robot_file(name: str) -> RobotFile:
 
 def unknown_robot(name: str) -> RobotError:
     """The error about a robot that is not here."""
+    if ":" in name:
+        return RobotError(
+            f"robot is {quote(name)}, which is made in Python; name it with --robot module:NAME "
+            "(in Python: catalogue.use_robot)"
+        )
     remedy = suggest("robot", name, shipped())
     return RobotError(f"robot is {quote(name)}; {remedy}; or menagerie:NAME, or a TOML file")
 
@@ -65,14 +72,19 @@ def use_robot(file: RobotFile, name: str | None = None) -> str:
       RobotError: if a field is invalid, or the name is taken by a shipped robot.
     """
     name = name or file.name
-    values = dataclasses.asdict(file) | {"folder": str(file.folder)}
-    parse(RobotFile, values, RobotError)
+    parse(RobotFile, dataclasses.asdict(file), RobotError)
     if name in shipped() or name.endswith(".toml"):
         raise RobotError(
             f"name is {quote(name)}, which is a shipped robot's or a file's; give yours another"
         )
     _IN_PYTHON[name] = file
     return name
+
+
+def in_python(name: str) -> dict[str, Any] | None:
+    """A robot that is made in Python as JSON values, for another process; None for any other."""
+    file = _IN_PYTHON.get(name)
+    return file and json.loads(json.dumps(dataclasses.asdict(file), default=str))
 
 
 @functools.lru_cache(maxsize=8)
