@@ -184,7 +184,11 @@ def check_words(name: str, argv: Sequence[str]) -> None:
             flag = word.partition("=")[0].replace("_", "-")
             others = (*HELP, HELP_ALL, *negated)
             if flag.startswith("--") and flag not in known and flag not in others:
-                raise InputError(f"unknown flag {shorten(flag)}; {suggest('flag', flag, known)}")
+                remedy = suggest("flag", flag[2:], [own[2:] for own in known])
+                if remedy.startswith("known"):
+                    remedy = f"`mjx-balance train {HELP_ALL}` lists them all"
+                remedy = remedy.replace("you mean ", "you mean --")
+                raise InputError(f"unknown flag {shorten(flag)}; {remedy}")
     if chosen := value_of(argv, "--preset"):
         preset(chosen)
     names = {"suite": SUITES, "controller": CONTROLLERS, "robot": shipped()}

@@ -59,7 +59,7 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str, wanted: int = 2)
     ("flags", "named"),
     [
         ("--preset huge", "unknown preset 'huge'; known presets: paper, default, best"),
-        ("--warp-speed 9", "unknown flag --warp-speed; known flags: --run-dir, --resume"),
+        ("--warp-speed 9", "unknown flag --warp-speed; `mjx-balance train --help-all` lists"),
         ("--num_env 64", "unknown flag --num-env; did you mean --num-envs?"),
         ("--preset quik", "unknown preset 'quik'; did you mean quick?"),
         ("--robot go3", "robot is 'go3'; did you mean go2?"),

@@ -89,6 +89,7 @@ def imported_before(flags: str, sign: str) -> tuple[set[str], str]:
         env=environment() | {"PYTHONPROFILEIMPORTTIME": "1"},
     ) as process:
         packages: set[str] = set()
+        assert process.stdout is not None
         for line in process.stdout:
             if line.startswith("import time:"):
                 packages.add(line.rpartition("|")[2].strip().partition(".")[0])
