@@ -52,6 +52,7 @@ LINKS = {
     "benchmarks/README.md": "results.md",
     "docs/clusters.md": "clusters.md",
     "docs/install.md": "install.md",
+    "docs/python.md": "python.md",
     "../docs/clusters.md": "clusters.md",
     "../docs/other_algorithms.md": "other_algorithms.md",
     "../docs/results.md": "results.md",

@@ -18,16 +18,17 @@ from mjx_balance.files.run_folder import RunFolder, RunFolderError, unfinished_r
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report import figures, measuring
 from mjx_balance.training import finish
+from mjx_balance.training.validation import AnyPolicy
 
 CONFIG = preset("smoke")
 SEED = CONFIG.seed
 
 
 @pytest.fixture
-def export(make_run: Any, stub_learner: Any) -> Callable[..., list[Policy]]:
+def export(make_run: Any, stub_learner: Any) -> Callable[..., list[AnyPolicy]]:
     """Scales of the stub's parameters -> policies."""
 
-    def export(*scales: float) -> list[Policy]:
+    def export(*scales: float) -> list[AnyPolicy]:
         run = make_run(dataclasses.replace(CONFIG, num_seeds=len(scales)))
         return finish.export(run, stub_learner.state_of(*scales), 1.26)
 
