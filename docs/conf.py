@@ -53,6 +53,7 @@ LINKS = {
     "docs/browser.md": "browser.md",
     "docs/clusters.md": "clusters.md",
     "docs/install.md": "install.md",
+    "docs/python.md": "python.md",
     "../docs/clusters.md": "clusters.md",
     "../docs/other_algorithms.md": "other_algorithms.md",
     "../docs/results.md": "results.md",

@@ -4,9 +4,11 @@ Safe text is one short line without control characters. `runtime.py`, one file f
 copy of `shorten`.
 """
 
+import difflib
 import os
 import shlex
 import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 from typing import ClassVar
 
@@ -46,6 +48,13 @@ def quote(value: object) -> str:
         return shorten(repr(value))
     except ValueError:  # an int with too many digits
         return "a number of thousands of digits"
+
+
+def suggest(kind: str, name: object, known: Iterable[str]) -> str:
+    """Returns what the user may have meant by an unknown name, or else all known ones."""
+    names = list(known)
+    close = difflib.get_close_matches(str(name), names, n=1)
+    return f"did you mean {close[0]}?" if close else f"known {kind}s: {', '.join(names)}"
 
 
 def shell(path: Path) -> str:

@@ -33,19 +33,23 @@ import yaml
 from brax.training.agents.ppo import train as ppo
 from fixtures.headers import compiler
 
-from mjx_balance import cli, config, runtime
+from mjx_balance import cli, config, load_policy, runtime
 from mjx_balance.cli import browser
 from mjx_balance.cli import evaluate as evaluate_command
 from mjx_balance.cli import train as train_command
 from mjx_balance.envs import balance as env
 from mjx_balance.envs import brax as brax_training
 from mjx_balance.evaluation import rollout as evaluation
+from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.render import drawing as render
 from mjx_balance.report import page as report_page
 from mjx_balance.robots.catalogue import find_robot, shipped
 from mjx_balance.robots.schema import LegFile, RobotFile, parse_robot_file
 from mjx_balance.sim.engines.table import make_engine
 from mjx_balance.training import processes, run
+from mjx_balance.training.callbacks import Callbacks
+from mjx_balance.training.finish import Finished
+from mjx_balance.training.sizing import make_learner
 
 REPO = Path(__file__).resolve().parent.parent
 DOCS = REPO / "docs"
@@ -254,6 +258,9 @@ def check_toml(text: str) -> None:
         parse_robot_file(text, Path("my_robot.toml"))
 
 
+MY_SUITES = "from mjx_balance import Suite\nICE = Suite()\n"
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder of a page's snippets: the repository's, a robot's model, a run."""
@@ -263,8 +270,64 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "runs" / "NAME").mkdir(parents=True)
     best = REPO / "policies" / "best.safetensors"
     shutil.copy(best, tmp_path / "runs" / "NAME" / "policy.safetensors")
+    (tmp_path / "my_suites.py").write_text(MY_SUITES)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def train_at_once(wanted: Any, run_dir: Any = None, *_: Any, **own: Any) -> Any:
+    """Checks config, network and loss, tells the callbacks of a line; gives a shipped policy."""
+    config.check(wanted)
+    if own.get("network") or own.get("loss"):
+        on_c = env.BalanceEnv(dataclasses.replace(wanted, engine="mujoco"))
+        sized = dataclasses.replace(wanted, num_envs=8, num_devices=1, num_seeds=1)
+        dqn = dataclasses.replace(sized.dqn, batch_size=8)
+        sized = dataclasses.replace(sized, dqn=dqn)
+        learner = make_learner(sized, on_c, own.get("network"), own.get("loss"))
+        jax.eval_shape(learner.train_program(1), jax.eval_shape(lambda: learner.init(0)))
+    line = {"env_steps": 1, "train/reward": 0.5, "eval/corner/tilt_mean": 0.1}
+    listeners = Callbacks(own.get("callbacks", ()))
+    listeners.on_validation(line)
+    listeners.on_log(line)
+    folder = RunFolder(Path(run_dir or "run"))
+    folder.path.mkdir(parents=True, exist_ok=True)
+    folder.metrics.write_text('{"env_steps": 1}\n')
+    result = {"tilt_deg": {"mean": 0.1}, "falls": 0, "scenarios": 1}
+    return Finished(load_policy("best"), {"paper": result, "corner": result}, folder)
+
+
+class StubTrial:
+    """A trial of Optuna's, which is not installed here; the first is to be pruned."""
+
+    def __init__(self, number: int):
+        self.number = number
+        self.reports: list[tuple[float, int]] = []
+
+    def suggest_float(self, name: str, low: float, high: float) -> float:
+        return (low + high) / 2
+
+    def report(self, value: float, step: int) -> None:
+        self.reports.append((value, step))
+
+    def should_prune(self) -> bool:
+        return self.number == 0
+
+
+def stub_optuna() -> types.SimpleNamespace:
+    """What the page uses of Optuna."""
+
+    class TrialPruned(Exception):
+        pass
+
+    def optimize(objective: Callable[[Any], float], n_trials: int) -> None:
+        pruned, done = (StubTrial(k) for k in range(2))
+        with pytest.raises(TrialPruned):
+            objective(pruned)
+        assert objective(done) == 0.1
+        assert pruned.reports == done.reports == [(0.1, 1)]
+
+    study = types.SimpleNamespace(optimize=optimize)
+    return types.SimpleNamespace(TrialPruned=TrialPruned, create_study=lambda: study)
 
 
 @pytest.fixture
@@ -296,13 +359,14 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monotonic = lambda: now[0]  # noqa: E731
     for owner, name, value in (
         (evaluate_command, "run_suite", few),
+        (evaluation, "run_suite", few),
         (evaluation, "policy_scene", scene_of),
         (render, "write", lambda path, *_: path.write_bytes(b"")),
         (render, "Window", mock.MagicMock(return_value=shut)),
         (browser, "page_folder", lambda: REPO / "demo" / "src"),
         (browser, "write_data", lambda *_: None),
         (http.server.ThreadingHTTPServer, "serve_forever", lambda server: None),
-        (run, "train", lambda wanted, *_: config.check(wanted)),
+        (run, "train", train_at_once),
         (ppo, "train", train_ppo),
         (train_command, "read_run_config", lambda path: config.preset("default")),
         (processes, "find_cluster", lambda *_: first),
@@ -317,6 +381,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         (runtime.Controller.__init__, "__defaults__", (monotonic,)),
     ):
         monkeypatch.setattr(owner, name, value)
+    monkeypatch.setitem(sys.modules, "optuna", stub_optuna())
 
 
 def name_of(page: Path) -> str:
@@ -421,7 +486,7 @@ DOCUMENTED = sorted(
 )
 WANTED = (
     *("policy.file", "runtime", "config.schema", "robots.schema", "evaluation.rollout", "dqn.dqn"),
-    *("envs.balance", "envs.brax", "envs.gym", "sim.engines.table"),
+    *("envs.balance", "envs.brax", "envs.gym", "sim.engines.table", "api", "training.callbacks"),
 )
 """Modules that the API pages must have."""
 

@@ -28,7 +28,7 @@ from mjx_balance.config import ConfigError, TaskConfig, to_dict
 from mjx_balance.errors import InputError
 from mjx_balance.evaluation.controllers import ImuPD
 from mjx_balance.evaluation.rollout import policy_scene, suite_scene
-from mjx_balance.evaluation.suites import SUITES, SuiteError, check_seed, check_suite, draw_suite
+from mjx_balance.evaluation.suites import SUITES, SuiteError, check_seed, draw_suite, find_suite
 from mjx_balance.policy.file import convert_policy, find_policy, load_policy, shipped_policies
 from mjx_balance.policy.manifest import PolicyError
 from mjx_balance.robots.catalogue import robot_file
@@ -304,7 +304,8 @@ def view_in_browser(args: ControllerArgs, suite: str | None, seed: int, port: in
     """
     page = page_folder()
     scene, _ = args.load()
-    check_suite(suite)
+    if suite is not None:
+        find_suite(suite)
     check_seed(seed)
     if args.controller not in (None, *BASELINES):
         raise InputError(

@@ -1,27 +1,27 @@
 """Functions that several commands use."""
 
+import contextlib
 import dataclasses
+import importlib
+import os
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from mjx_balance.cli.words import HELP as HELP
+from mjx_balance.cli.words import complain as complain
 from mjx_balance.config import check, preset
-from mjx_balance.errors import PATH, USAGE_ERROR, InputError, shorten
+from mjx_balance.errors import MESSAGE, InputError, quote, shorten, suggest
 from mjx_balance.evaluation import rollout
 from mjx_balance.evaluation.controllers import Controller, ControllerError, make_controller
+from mjx_balance.evaluation.suites import Suite
 from mjx_balance.policy.file import load_policy
+from mjx_balance.robots.catalogue import MENAGERIE, use_robot
 from mjx_balance.robots.limits import for_robot
+from mjx_balance.robots.schema import RobotFile, read_robot_file
 from mjx_balance.sim.scene import Scene, load_scene
-
-HELP = ("-h", "--help")
-
-
-def complain(message: str, code: int = USAGE_ERROR) -> int:
-    """Prints an error message; returns the exit code."""
-    print(f"mjx-balance: {shorten(message, PATH)}", file=sys.stderr)
-    return code
 
 
 def check_out(name: str, path: Path | None, suffix: str = "") -> None:
@@ -40,6 +40,62 @@ def check_out(name: str, path: Path | None, suffix: str = "") -> None:
         raise InputError(f"cannot write {path}: its folder does not exist")
 
 
+def find_named(flag: str, text: str) -> Any:
+    """Imports what `module:NAME` names, from the current folder or an installed package.
+
+    Only a word of the command line comes here: what a policy or a run folder says is never
+    imported.
+
+    Raises:
+      InputError: if there is no such module or name, or the module fails.
+    """
+    module, _, name = text.partition(":")
+    sys.path.insert(0, os.getcwd())
+    try:
+        owner = importlib.import_module(module)
+    except Exception as error:  # whatever the user's code raises
+        reason = shorten(error, MESSAGE // 2) or type(error).__name__
+        raise InputError(
+            f"{flag} is {quote(text)}, but module {quote(module)} cannot be imported: {reason}"
+        ) from error
+    finally:
+        with contextlib.suppress(ValueError):
+            sys.path.remove(os.getcwd())
+    if not hasattr(owner, name):
+        known = [x for x in vars(owner) if not x.startswith("_")]
+        remedy = suggest("name", name, known)
+        raise InputError(f"{flag} is {quote(text)}, but {module} has no {quote(name)}; {remedy}")
+    return getattr(owner, name)
+
+
+def suite_of(text: str) -> str | Suite:
+    """The suite that flag `suite` names: its name, or the `Suite` at `module:NAME`."""
+    if ":" not in text:
+        return text
+    suite = find_named("suite", text)
+    if not isinstance(suite, Suite):
+        raise InputError(f"suite is {quote(text)}, which is {quote(suite)}; it must be a Suite")
+    return dataclasses.replace(suite, name=text)
+
+
+def robot_of(text: str) -> str:
+    """The robot that flag `robot` names; one at `module:NAME` becomes known by these words.
+
+    It is a `RobotFile`, or the path of a TOML file.
+    """
+    if ":" not in text or text.startswith(MENAGERIE) or text.endswith(".toml"):
+        return text
+    robot = find_named("robot", text)
+    if isinstance(robot, (str, Path)):
+        robot = read_robot_file(Path(robot))
+    if not isinstance(robot, RobotFile):
+        raise InputError(
+            f"robot is {quote(text)}, which is {quote(robot)}; it must be a RobotFile, or the path "
+            "of a TOML file"
+        )
+    return use_robot(robot, text)
+
+
 @dataclasses.dataclass(frozen=True)
 class ControllerArgs:
     """The flags that say who balances."""
@@ -49,8 +105,8 @@ class ControllerArgs:
     controller: str | None = None
     """Baseline instead of a policy: none, pd-imu, pd-attitude, rate-oracle or clairvoyant."""
     robot: str | None = None
-    """Robot of the baseline, or of a policy whose robot is not shipped: TOML file or
-    menagerie:NAME."""
+    """Robot of the baseline, or of a policy whose robot is not shipped: TOML file, menagerie:NAME,
+    or module:NAME of your own."""
     action: Literal["grid", "continuous"] | None = None
     """Command height changes of the grid, or any up to its greatest; none: as the policy was
     trained, and any for a baseline."""
@@ -63,12 +119,13 @@ class ControllerArgs:
         """
         if (self.policy is None) == (self.controller is None):
             raise ControllerError("name a policy file or --controller NAME, one of the two")
+        robot = self.robot and robot_of(self.robot)
         if self.policy is not None:
             policy = load_policy(self.policy)
             if self.action is not None:
                 policy = policy.with_action(self.action)
-            return rollout.policy_scene(policy, robot=self.robot), rollout.observing(policy)
-        config = for_robot(preset("default"), self.robot or "quadruped")
+            return rollout.policy_scene(policy, robot=robot), rollout.observing(policy)
+        config = for_robot(preset("default"), robot or "quadruped")
         if self.action is not None:
             task = dataclasses.replace(config.task, action=self.action)
             config = dataclasses.replace(config, task=task)

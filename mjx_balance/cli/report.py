@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from mjx_balance.cli.common import check_out, complain
+from mjx_balance.cli.common import check_out, complain, robot_of
 from mjx_balance.errors import PATH, shorten
 from mjx_balance.report.progress import Display
 
@@ -23,7 +23,8 @@ class ReportArgs:
     scenarios: int = 64
     """Scenarios per suite and controller."""
     robot: str | None = None
-    """Robot of the policy, as TOML file or menagerie:NAME; none: it must be a shipped one."""
+    """Robot of the policy, as TOML file, menagerie:NAME or module:NAME; none: it must be a shipped
+    one."""
 
 
 def report(argv: list[str]) -> int:
@@ -34,8 +35,9 @@ def report(argv: list[str]) -> int:
         return complain("name at least one run folder")
     check_out("out", args.out)
     out = args.out or args.run_dirs[0] / "report.html"
+    robot = args.robot and robot_of(args.robot)
     display = Display(Console(stderr=True))
-    missing = write_report(args.run_dirs, out, args.scenarios, display.bar, args.robot)
+    missing = write_report(args.run_dirs, out, args.scenarios, display.bar, robot)
     for sentence in missing:
         complain(sentence)
     print(shorten(out, PATH))

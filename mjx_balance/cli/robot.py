@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 from tyro.conf import Positional
 
-from mjx_balance.cli.common import check_out, complain
+from mjx_balance.cli.common import check_out, complain, robot_of
 from mjx_balance.errors import FAILED, PATH, shell, shorten
 from mjx_balance.files.run_folder import write_atomically
 
@@ -21,14 +21,14 @@ def check(robot: Positional[str], picture: Path | None = None) -> int:
     """Build a robot, tilt it on the board, and print the results.
 
     Args:
-      robot: TOML file, shipped robot's name, or menagerie:NAME.
+      robot: TOML file, shipped robot's name, menagerie:NAME, or module:NAME of your own.
       picture: PNG file to draw; none: NAME-check.png in this folder, which is overwritten.
     """
     from mjx_balance.cli import inspection
     from mjx_balance.render import drawing as render
 
     check_out("picture", picture, ".png")
-    scene, tilt_test = inspection.inspect(robot)
+    scene, tilt_test = inspection.inspect(robot_of(robot))
     print("\n".join(inspection.describe(scene, tilt_test)))
     problems = inspection.problems(scene, tilt_test)
     for sentence in problems:

@@ -7,7 +7,8 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_balance.cli.common import HELP, complain
+from mjx_balance.cli.common import HELP, complain, robot_of
+from mjx_balance.cli.words import RunArgs
 from mjx_balance.config import Config, preset, read_run_config
 from mjx_balance.errors import FAILED, INTERRUPTED, MESSAGE, how_to_install, shorten
 from mjx_balance.policy.file import PolicyError
@@ -17,24 +18,9 @@ from mjx_balance.sim.engines.table import unused_modules
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainArgs:
+class TrainArgs(RunArgs):
     """Train a policy, export it, and evaluate it in plain MuJoCo."""
 
-    run_dir: Path | None = None
-    """Folder to create for the run; none: runs/PRESET-SEED-TIME."""
-    resume: Path | None = None
-    """Run folder to continue, instead of a new one; its config sets all defaults."""
-    profile: bool = False
-    """Trace a call of the training program and print the share of time that each part takes."""
-    distributed: bool = False
-    """Train with several processes, which Slurm, Open MPI or Kubernetes starts on one machine or
-    many. Without them, use the next three flags. Give all processes the same other flags."""
-    coordinator: str | None = None
-    """HOST:PORT at which process 0 listens; none: the cluster sets it."""
-    process_id: int | None = None
-    """Index of this process, from 0."""
-    num_processes: int | None = None
-    """Number of processes."""
     config: tyro.conf.OmitArgPrefixes[Config] = dataclasses.field(default_factory=Config)
 
 
@@ -90,8 +76,9 @@ def train(argv: list[str]) -> int:
 def _parse(argv: list[str]) -> TrainArgs:
     """Parses the flags; defaults are those of preset and robot, or of the run to resume."""
     start, _ = tyro.cli(StartingPoint, args=argv, return_unknown_args=True, add_help=False)
+    robot = robot_of(start.robot)
     if start.resume is None:
-        default = TrainArgs(config=for_robot(preset(start.preset), start.robot))
+        default = TrainArgs(config=for_robot(preset(start.preset), robot))
     else:
         default = TrainArgs(config=read_run_config(start.resume))
     return tyro.cli(TrainArgs, args=argv, prog="mjx-balance train", default=default)

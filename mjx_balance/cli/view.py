@@ -9,11 +9,11 @@ import numpy as np
 import tyro
 
 from mjx_balance.cli.browser import view_in_browser
-from mjx_balance.cli.common import ControllerArgs, complain
+from mjx_balance.cli.common import ControllerArgs, complain, suite_of
 from mjx_balance.envs.batch import BatchEnv, Episodes
 from mjx_balance.evaluation.controllers import Controller
 from mjx_balance.evaluation.rollout import look, suite_scene
-from mjx_balance.evaluation.suites import check_seed, draw_suite
+from mjx_balance.evaluation.suites import Suite, check_seed, draw_suite
 from mjx_balance.robots.limits import greatest_incline
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task import tilt
@@ -34,7 +34,8 @@ class ViewArgs(ControllerArgs):
     """Watch a policy in MuJoCo's viewer; keys tilt the board and push the robot."""
 
     suite: str | None = None
-    """Suite that moves the board and pushes the robot; none: keys do."""
+    """Suite that moves the board and pushes the robot, or module:NAME of your own; none: keys
+    do."""
     seed: int = 0
     """Seed of the suite's scenarios, and of the direction of pushes by key."""
     browser: bool = False
@@ -50,7 +51,8 @@ def view(argv: list[str]) -> int:
     from mjx_balance.render import drawing as render
 
     scene, controller = args.load()
-    session = Session(scene, controller, args.suite, args.seed)
+    suite = args.suite and suite_of(args.suite)
+    session = Session(scene, controller, suite, args.seed)
     try:
         window = render.Window(session.scene, session.press)
     except render.RenderError as error:
@@ -70,7 +72,7 @@ class Session:
     """A robot on a board that keys or a suite tilt, decision by decision; restarts after a fall."""
 
     def __init__(
-        self, scene: Scene, controller: Controller, suite: str | None = None, seed: int = 0
+        self, scene: Scene, controller: Controller, suite: str | Suite | None = None, seed: int = 0
     ):
         """Stands the robot on the level board, which keys move if there is no suite.
 

@@ -11,6 +11,7 @@ from mjx_balance.config.schema import (
     RandomizationConfig,
     TaskConfig,
 )
+from mjx_balance.errors import quote, suggest
 
 _LAST_600_MS = tuple(range(0, 150, 5))
 # The grid adds some 40% to 75% to the mean tilt of the same network (docs/how_it_works.md).
@@ -148,5 +149,5 @@ PRESETS: Mapping[str, Config] = {
 def preset(name: str) -> Config:
     """Returns the preset called `name`; raises `ConfigError` with the known names."""
     if name not in PRESETS:
-        raise ConfigError(f"unknown preset {name!r}; known presets: {', '.join(PRESETS)}")
+        raise ConfigError(f"unknown preset {quote(name)}; {suggest('preset', name, PRESETS)}")
     return PRESETS[name]

@@ -6,11 +6,11 @@ cites a section of the paper; "chosen" marks a number that the paper does not gi
 
 import dataclasses
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 
-from mjx_balance.errors import InputError
+from mjx_balance.errors import InputError, quote, suggest
 from mjx_balance.files.validation import STRICT
 
 ACTION_AXES = 2  # roll and pitch, paper Eq. 3
@@ -359,3 +359,31 @@ class Config:
     task: TaskConfig = dataclasses.field(default_factory=TaskConfig)
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     dqn: DQNConfig = dataclasses.field(default_factory=DQNConfig)
+
+    def replace(self, **fields: Any) -> Self:
+        """Returns this config with other values, as `dataclasses.replace`.
+
+        A field of a section needs no section: `config.replace(reward_toward=0.5, gamma=0.2)`. A
+        list becomes a tuple. `check` finds values that are out of bounds, before anything runs.
+
+        Raises:
+          ConfigError: for an unknown field.
+        """
+        values = {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
+        known: list[str] = []
+        changes: dict[str, Any] = {}
+        for name, section in (("", self), *((name, getattr(self, name)) for name in SECTIONS)):
+            section: Any = values.get(name, section)
+            names = [field.name for field in dataclasses.fields(section)]
+            known += names
+            own = {field: values[field] for field in names if field in values}
+            if name and own:
+                changes[name] = dataclasses.replace(section, **own)
+            else:
+                changes |= own
+        for name in set(values) - set(known):
+            raise ConfigError(f"unknown field {quote(name)}; {suggest('field', name, known)}")
+        return dataclasses.replace(self, **changes)
+
+
+SECTIONS = ("task", "randomization", "dqn")  #: fields of `Config` that have fields of their own

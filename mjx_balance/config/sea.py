@@ -9,10 +9,9 @@ with variance H^2 / 16. Its integral is elementary, so that a share of the energ
 Frequencies above `HIGHEST` w_p are left out; their energy, 7.5%, goes to the others.
 """
 
+import functools
 import math
 from typing import Any
-
-import numpy as np
 
 from mjx_balance.config.schema import GRAVITY, ConfigError, TaskConfig
 
@@ -41,11 +40,14 @@ def fade(time: Any, period: float) -> Any:
     return part * part * (3.0 - 2.0 * part)
 
 
-def _bounds() -> tuple[float, float]:
-    """Greatest rate and acceleration of a sea whose amplitudes add up to 1, in peak periods.
+@functools.cache
+def bounds() -> tuple[float, float]:
+    """Greatest speed and acceleration of a sea of significant height 1 and peak period 1 s.
 
     The derivatives of `fade` times a sine of each wave, in the fastest case, at the worst time.
     """
+    import numpy as np  # here, so that a command line is read before it is imported
+
     time = np.linspace(0.0, 1.0, 1001)
     omega = 2 * np.pi * frequency(np.arange(1, WAVES + 1)[:, None] / WAVES)
     size, slope, bend = fade(time, 1.0), 6 * time * (1 - time), 6 - 12 * time
@@ -54,17 +56,13 @@ def _bounds() -> tuple[float, float]:
     return float(rate.mean(axis=0).max()), float(acceleration.mean(axis=0).max())
 
 
-RATE, ACCELERATION = _bounds()
-"""Bounds of a sea's speed and acceleration: of significant height 1 and peak period 1 s."""
-
-
 def significant_angle(task: TaskConfig) -> float:
     """Significant height of the board's angle, deg, which no angle exceeds.
 
     Raises:
       ConfigError: if it exceeds max_incline, or the board may turn faster than board_rate.
     """
-    fastest = task.board_rate * task.sea_period / RATE
+    fastest = task.board_rate * task.sea_period / bounds()[0]
     if task.sea_angle is None:
         return min(task.max_incline, fastest)
     if task.sea_angle > task.max_incline:
@@ -83,7 +81,7 @@ def significant_angle(task: TaskConfig) -> float:
 
 def check_platform(task: TaskConfig) -> None:
     """Raises `ConfigError` if the platform may fall away faster than the robot."""
-    highest = GRAVITY * task.sea_period**2 / ACCELERATION
+    highest = GRAVITY * task.sea_period**2 / bounds()[1]
     if task.sea_height > highest:
         raise ConfigError(
             f"sea_height is {task.sea_height} m; with sea_period {task.sea_period} s the platform "

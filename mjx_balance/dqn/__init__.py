@@ -1,6 +1,6 @@
 """A Deep Q-Network for any brax `Env` with discrete actions."""
 
-from mjx_balance.dqn.dqn import DQN, DQNSpec, TrainState
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn.dqn import DQN, DQNSpec, Loss, TrainState, td_error
+from mjx_balance.dqn.networks import Network, QNetwork
 
-__all__ = ["DQN", "DQNSpec", "QNetwork", "TrainState"]
+__all__ = ["DQN", "DQNSpec", "Loss", "Network", "QNetwork", "TrainState", "td_error"]

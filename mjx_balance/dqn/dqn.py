@@ -15,7 +15,7 @@ over it.
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -38,12 +38,14 @@ from mjx_balance.dqn.mesh import (
     mean_where,
     on_each_device,
 )
-from mjx_balance.dqn.networks import QNetwork
+from mjx_balance.dqn.networks import Network, Whitened
 from mjx_balance.dqn.normalization import RunningStatistics
 from mjx_balance.dqn.replay import ReplayState, Symmetries, Transition
-from mjx_balance.policy.heads import Head
+from mjx_balance.policy.heads import Additive, Head
 
-Params: TypeAlias = Any  #: a network's variables, a flax pytree
+Params: TypeAlias = Any  #: a network's variables, a pytree
+Loss: TypeAlias = Callable[[Head, Any, jax.Array, jax.Array, Head, Head], jax.Array]
+"""A loss of one transition: the arguments of `td_error` -> ()."""
 Means: TypeAlias = dict[str, Mean]
 
 
@@ -131,13 +133,15 @@ class DQN:
     Args:
       env: unbatched, with `action_size` discrete actions, or with `spec.continuous` as many
         numbers from -1 to 1; `info["truncation"]`, if there, marks time-outs.
-      network: maps (..., obs_size) to (..., action_size).
+      network: maps (..., obs_size) to (..., action_size): a `QNetwork` or another `Network`.
       spec: the numbers of the run.
+      own_loss: loss of a transition, averaged over a batch; None: that of `DQN.loss`.
     """
 
     env: Env
-    network: QNetwork
+    network: Network
     spec: DQNSpec
+    own_loss: Loss | None = None
 
     @cached_property
     def mesh(self) -> Mesh:
@@ -370,32 +374,45 @@ class DQN:
         """Mean squared TD error of a batch, or twice the Huber loss with `huber_delta`.
 
         With `double`, the online network selects the action that the target network evaluates.
+        With `own_loss`, its mean over the batch.
         """
 
-        def error(t: Transition) -> jax.Array:
+        def of(loss: Loss, t: Transition) -> jax.Array:
             q_tm1, q_t = self.head(params, t.obs), self.head(target_params, t.next_obs)
             q_t_selector = self.head(params, t.next_obs) if config.double else q_t
             discount_t = config.gamma * (1 - t.terminated)
-            return td_error(q_tm1, t.action, t.reward, discount_t, q_t, q_t_selector)
+            return loss(q_tm1, t.action, t.reward, discount_t, q_t, q_t_selector)
 
-        errors = jax.vmap(error)(batch)
+        if self.own_loss is not None:
+            return jnp.mean(jax.vmap(partial(of, self.own_loss))(batch))
+        errors = jax.vmap(partial(of, td_error))(batch)
         if config.huber_delta is None:
             return jnp.mean(errors**2)
         return 2 * jnp.mean(optax.losses.huber_loss(errors, delta=config.huber_delta))
 
     def head(self, params: Params, obs: Float[Array, "*batch obs"]) -> Head:
         """The network's head for raw observations."""
-        head: Any = self.network.apply(params, obs, method="head")
+        if isinstance(params, Whitened):
+            with jax.default_matmul_precision("highest"):
+                params, obs = params.params, (obs - params.mean) @ params.matrix
+        if hasattr(self.network, "head"):
+            head: Any = self.network.apply(params, obs, method="head")
+        else:
+            values = self.network.apply(params, obs)
+            head = Additive(values, (values.shape[-1],))
         return head.off_grid() if self.spec.continuous else head
 
     def fold(self, params: Params, statistics: RunningStatistics) -> Params:
         """Folds the whitening into the parameters, which is cheaper than whitening every input.
 
-        With `zero_at_rest`, the head's best point for an observation of zeros then becomes 0.
+        Parameters of a network that does not know how become `Whitened`. With `zero_at_rest`, the
+        head's best point for an observation of zeros then becomes 0.
         """
+        network: Any = self.network
         if self.spec.config.whiten_steps:
-            params = self.network.fold_whitening(params, statistics.mean, statistics.matrix)
-        return self.network.fold_rest(params) if self.spec.config.zero_at_rest else params
+            fold = getattr(network, "fold_whitening", Whitened)
+            params = fold(params, statistics.mean, statistics.matrix)
+        return network.fold_rest(params) if self.spec.config.zero_at_rest else params
 
 
 def td_error(

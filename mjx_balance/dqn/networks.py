@@ -1,13 +1,41 @@
-"""Q-networks."""
+"""Q-networks: ours, and what any other needs."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from mjx_balance.policy import heads
+
+
+class Network(Protocol):
+    """What the DQN needs of a network. A flax module has both, if its call gives action values.
+
+    A network may have three more methods, as `QNetwork` has:
+
+    - `head(obs)`, a head (`policy.heads`) instead of action values. With actions off the grid it
+      must be a radial one.
+    - `fold_whitening(params, mean, matrix)`. Without it, observations are whitened before the call.
+    - `fold_rest(params)`, for `DQNConfig.zero_at_rest`.
+    """
+
+    def init(self, key: Any, obs: Any, /) -> Any:
+        """Returns parameters, a pytree, by a PRNG key and an observation (obs_size,)."""
+        ...
+
+    def apply(self, params: Any, obs: Any, /, **method: Any) -> Any:
+        """Returns action values (..., num_actions) of observations (..., obs_size)."""
+        ...
+
+
+class Whitened(NamedTuple):
+    """Parameters of a network that sees whitened observations, with the whitening."""
+
+    params: Any
+    mean: jax.Array  #: (obs_size,)
+    matrix: jax.Array  #: (obs_size, obs_size)
 
 
 class QNetwork(nn.Module):

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjx_balance.config import ACTION_AXES
 from mjx_balance.envs.batch import BatchEnv, Episodes
-from mjx_balance.errors import InputError
+from mjx_balance.errors import InputError, quote, suggest
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task import tilt
 from mjx_balance.task.actions import to_command
@@ -227,6 +227,6 @@ def make_controller(name: str, scene: Scene) -> Controller:
     """Builds the controller called `name`; raises `ControllerError` with the known names."""
     if name not in CONTROLLERS:
         raise ControllerError(
-            f"unknown controller {name!r}; known controllers: {', '.join(CONTROLLERS)}"
+            f"unknown controller {quote(name)}; {suggest('controller', name, CONTROLLERS)}"
         )
     return CONTROLLERS[name](scene)

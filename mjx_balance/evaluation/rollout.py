@@ -8,7 +8,7 @@ simulation warning or a state that is not finite counts as a fall.
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,10 +16,10 @@ from mjx_balance.config import Config, TaskConfig
 from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.errors import InputError, quote
 from mjx_balance.evaluation.controllers import Controller, View
-from mjx_balance.evaluation.suites import SUITES, draw_suite
+from mjx_balance.evaluation.suites import Suite, draw_suite, find_suite, suite_name
 from mjx_balance.machine import available_memory
-from mjx_balance.policy.file import Policy, PolicyError
-from mjx_balance.robots.catalogue import RobotError, find_robot, shipped
+from mjx_balance.policy.file import PolicyError
+from mjx_balance.robots.catalogue import Robot, RobotError, find_robot, shipped
 from mjx_balance.sim.scene import Scene, load_scene, soften
 from mjx_balance.task.actions import action_table
 from mjx_balance.task.reward import failed
@@ -34,7 +34,19 @@ class EvaluationError(InputError):
     """An evaluation that cannot be run; the message says why."""
 
 
-def observing(policy: Policy) -> Controller:
+class GreedyPolicy(Protocol):
+    """What an evaluation needs of a policy."""
+
+    config: Config
+    robot: Robot
+    scene_hash: str
+
+    def command(self, obs: np.ndarray) -> np.ndarray:
+        """Height changes (n, 2), m, for observations (n, obs_size)."""
+        ...
+
+
+def observing(policy: GreedyPolicy) -> Controller:
     """The policy as a controller: it looks at the observation alone."""
     return lambda view: policy.command(view.obs)
 
@@ -140,12 +152,13 @@ def _record(
         rollout.qpos[ids, span.stop :] = path[:, -1:]
 
 
-def summarize(rollout: Rollout, suite: str, duration: float, seed: int) -> dict[str, Any]:
+def summarize(rollout: Rollout, suite: str | Suite, duration: float, seed: int) -> dict[str, Any]:
     """The evaluation as JSON values, tilt statistics over every physics step."""
     tilts, falls = rollout.tilt, int(rollout.fell.sum())
+    sea = find_suite(suite).motion == "sea"
     p50, p95, p99 = np.percentile(tilts, (50, 95, 99)).tolist()
     return {
-        "suite": suite,
+        "suite": suite_name(suite),
         "scenarios": len(tilts),
         "duration_s": float(duration),
         "seed": seed,
@@ -160,7 +173,7 @@ def summarize(rollout: Rollout, suite: str, duration: float, seed: int) -> dict[
             "max": float(tilts.max()),
         },
         "action_mm_mean": float(np.nanmean(rollout.action_mm)),
-        "action_mm_settled": None if SUITES[suite].motion == "sea" else settled_action(rollout),
+        "action_mm_settled": None if sea else settled_action(rollout),
         "physics_steps_per_second": float(rollout.fell_at.sum() / rollout.seconds),
     }
 
@@ -174,7 +187,7 @@ def settled_action(rollout: Rollout) -> float | None:
     return None if np.isnan(values).all() else float(np.nanmean(values))
 
 
-def policy_scene(policy: Policy, robot: str | None = None) -> Scene:
+def policy_scene(policy: GreedyPolicy, robot: str | None = None) -> Scene:
     """Builds the scene a policy was trained in.
 
     Args:
@@ -213,18 +226,22 @@ def policy_scene(policy: Policy, robot: str | None = None) -> Scene:
     return scene
 
 
-def suite_scene(scene: Scene, suite: str) -> Scene:
-    """The scene in which a suite runs: this one, or one with a platform or soft servos."""
-    chosen = SUITES.get(suite)
-    if chosen is not None and chosen.platform and not scene.task.platform:
+def suite_scene(scene: Scene, suite: str | Suite) -> Scene:
+    """The scene in which a suite runs: this one, or one with a platform or soft servos.
+
+    Raises:
+      SuiteError: as `find_suite`.
+    """
+    chosen = find_suite(suite)
+    if chosen.platform and not scene.task.platform:
         task = dataclasses.replace(scene.task, platform=True)
         return load_scene(Config(robot=scene.robot_source, task=task))
-    return soften(scene) if chosen is not None and chosen.soft else scene
+    return soften(scene) if chosen.soft else scene
 
 
 def evaluate(
-    policy: Policy,
-    suite: str,
+    policy: GreedyPolicy,
+    suite: str | Suite,
     scenarios: int,
     duration: float,
     seed: int,
@@ -270,7 +287,7 @@ def check_fits(task: TaskConfig, scenarios: int, duration: float, recorded: int 
 def run_suite(
     scene: Scene,
     controller: Controller,
-    suite: str,
+    suite: str | Suite,
     scenarios: int,
     duration: float,
     seed: int,

@@ -9,7 +9,8 @@ import numpy as np
 from mjx_balance.config import DEGREE, RandomizationConfig, TaskConfig
 from mjx_balance.config.sea import check_platform
 from mjx_balance.envs.batch import Episodes, stacked
-from mjx_balance.errors import InputError
+from mjx_balance.errors import InputError, quote, suggest
+from mjx_balance.files.validation import check_types
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.robots.limits import authority, check_delays, greatest_incline, scale_ranges
 from mjx_balance.task import events, tilt
@@ -34,7 +35,7 @@ def _corner(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """A kind of scenario."""
+    """A kind of scenario. One of your own goes wherever a suite's name does."""
 
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
@@ -45,6 +46,7 @@ class Suite:
     fast: bool = False  #: board speeds uniform from the config's to the authority limit
     steep: bool = False  #: inclines uniform from the config's to the reach of the legs
     tilted: bool = False  #: board and body start tilted, by up to a decision from a fall
+    name: str = "own"  #: in results, of a suite that is not in `SUITES`
 
 
 SUITES: dict[str, Suite] = {
@@ -111,14 +113,32 @@ def check_seed(seed: int) -> None:
         raise SuiteError(f"seed is {seed}; it must not be negative")
 
 
-def check_suite(suite: str | None) -> None:
-    """Raises `SuiteError` for the name of no suite; None is no suite at all."""
-    if suite is not None and suite not in SUITES:
-        raise SuiteError(f"unknown suite {suite!r}; known suites: {', '.join(SUITES)}")
+def find_suite(suite: str | Suite) -> Suite:
+    """Returns a suite by its name, or one of the user's own after a check.
+
+    Raises:
+      SuiteError: if there is none, or a field of it has an impossible value.
+    """
+    if isinstance(suite, str):
+        if suite not in SUITES:
+            raise SuiteError(f"unknown suite {quote(suite)}; {suggest('suite', suite, SUITES)}")
+        return SUITES[suite]
+    if not isinstance(suite, Suite):
+        raise SuiteError(f"suite is {quote(suite)}; it must be a suite's name, or a Suite")
+    check_types(suite.randomization, SuiteError)
+    if suite.motion is not None and suite.motion not in tilt.MOTIONS:
+        remedy = suggest("motion", suite.motion, tilt.MOTIONS)
+        raise SuiteError(f"motion of suite {suite.name} is {quote(suite.motion)}; {remedy}")
+    return suite
+
+
+def suite_name(suite: str | Suite) -> str:
+    """The name of a suite in results."""
+    return suite.name if isinstance(suite, Suite) else suite
 
 
 def draw_suite(
-    task: TaskConfig, robot: Robot, suite: str, scenarios: int, duration: float, seed: int
+    task: TaskConfig, robot: Robot, suite: str | Suite, scenarios: int, duration: float, seed: int
 ) -> Episodes:
     """Draws a suite's episodes, each of `duration` s.
 
@@ -131,12 +151,11 @@ def draw_suite(
       SuiteError: for an unknown suite, a negative seed, a suite that needs another scene
         (`rollout.suite_scene`), or a board that does not arrive before its next target.
     """
-    check_suite(suite)
+    chosen, name = find_suite(suite), suite_name(suite)
     check_seed(seed)
-    chosen = SUITES[suite]
     if chosen.platform and not task.platform:
         raise SuiteError(
-            f"suite {suite!r} moves a platform, which the scene does not have; it needs platform "
+            f"suite {name!r} moves a platform, which the scene does not have; it needs platform "
             "True in its config (evaluation.rollout.suite_scene)"
         )
     count = tilt.num_targets(task, duration)
@@ -152,7 +171,7 @@ def draw_suite(
     longest = float(np.max(2 * incline / rate))
     if longest > task.target_period:
         raise SuiteError(
-            f"target_period is {task.target_period} s, but in suite {suite!r} the board may take "
+            f"target_period is {task.target_period} s, but in suite {name!r} the board may take "
             f"{longest:.1f} s to its target; the period must not be shorter"
         )
     ranges, errors = scale_ranges(chosen.randomization, robot), None
@@ -167,7 +186,13 @@ def draw_suite(
         *(ranges, robot, params, round(duration / task.ctrl_dt)),
         lambda count: np.asarray([rng.uniform(size=count) for rng in own]),
     )
-    scenario = tilt.Scenario(chosen.targets(incline, uniform), np.zeros(scenarios), rate)
+    targets = np.asarray(chosen.targets(incline, uniform))
+    if targets.shape != uniform.shape:
+        raise SuiteError(
+            f"targets of suite {name!r} gives shape {targets.shape}; it must be {uniform.shape}: "
+            "roll and pitch of every target of every scenario"
+        )
+    scenario = tilt.Scenario(targets, np.zeros(scenarios), rate)
     if chosen.motion is not None:
         draw = tilt.MOTIONS[chosen.motion]
         still = task if chosen.platform else dataclasses.replace(task, sea_height=0.0)

@@ -54,6 +54,18 @@ class Policy:
         if self.radial:
             self.profile, self.stretch = weights["profile"], weights["stretch"]
 
+    def __repr__(self) -> str:
+        """What it is, in one line."""
+        dqn, training = self.config.dqn, self.manifest["training"]
+        steps = training.get("env_steps")
+        after = f" after {steps:,} decisions" if isinstance(steps, int) else ""
+        layers = " x ".join(map(str, dqn.hidden_sizes))
+        return (
+            f"Policy(preset {quote(self.config.preset)}{after}, robot {quote(self.robot.name)}, "
+            f"{self.observation_size} inputs, hidden layers {layers}, head {dqn.head}, "
+            f"action {self.config.task.action}, weights {self.fingerprint})"
+        )
+
     @property
     def fingerprint(self) -> str:
         """Digest of the weights, 16 hexadecimal digits."""

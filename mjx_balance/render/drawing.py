@@ -25,6 +25,8 @@ import numpy as np
 from mjx_balance.config import TaskConfig, from_dict, to_dict
 from mjx_balance.errors import MESSAGE, shorten
 from mjx_balance.files.run_folder import write_atomically
+from mjx_balance.robots.catalogue import in_python, use_robot
+from mjx_balance.robots.schema import RobotFile
 from mjx_balance.sim.scene import Scene, build_model
 
 FPS = 25
@@ -82,7 +84,8 @@ class Painter:
           RenderError: if no OpenGL backend works here.
         """
         self._size, reason = size, ""
-        where = {"task": to_dict(scene.task), "robot": scene.robot_source}
+        source = scene.robot_source
+        where = {"task": to_dict(scene.task), "robot": source, "file": in_python(source)}
         header = json.dumps(where | {"size": size})
         for backend in _backends():
             self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 closed by _end
@@ -238,6 +241,8 @@ def _serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keeps prints of libraries out of the pipe
     states = sys.stdin.buffer
     header = json.loads(states.readline())
+    if header["file"]:
+        use_robot(from_dict(RobotFile, header["file"]), header["robot"])
     model = build_model(from_dict(TaskConfig, header["task"]), header["robot"], visual=True)
     data = mujoco.MjData(model)
     width, height = header["size"]

@@ -15,7 +15,7 @@ from annotated_types import Len
 from mjx_balance.config import to_dict
 from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_controller
 from mjx_balance.evaluation.envelope import Envelope, envelope
-from mjx_balance.evaluation.rollout import Rollout, observing, run_suite, summarize
+from mjx_balance.evaluation.rollout import GreedyPolicy, Rollout, observing, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import read_json, write_atomically
 from mjx_balance.files.sources import code
@@ -122,7 +122,7 @@ def _measure(
 
 
 def record_rollout(
-    policy: Policy,
+    policy: GreedyPolicy,
     scene: Scene,
     suite: str,
     duration: float,
@@ -137,5 +137,5 @@ def record_rollout(
     return run_suite(scene, acting, suite, 1, duration, seed, record=True)
 
 
-def _controller(name: str, policy: Policy, scene: Scene) -> Controller:
+def _controller(name: str, policy: GreedyPolicy, scene: Scene) -> Controller:
     return observing(policy) if name == "policy" else make_controller(name, scene)

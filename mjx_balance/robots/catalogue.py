@@ -1,25 +1,27 @@
-"""Finds robots: shipped ones by name, Menagerie's by `menagerie:NAME`, others by TOML file."""
+"""Finds robots: shipped ones by name, Menagerie's by `menagerie:NAME`, others by TOML file.
 
+`use_robot` adds one that is made in Python, for this process.
+"""
+
+import dataclasses
 import functools
+import json
 from pathlib import Path
+from typing import Any
 
 import mujoco
 
-from mjx_balance.errors import quote
+from mjx_balance.errors import quote, suggest
+from mjx_balance.files.validation import parse
+from mjx_balance.robots import OURS, SHIPPED, shipped
 from mjx_balance.robots.build import build
 from mjx_balance.robots.draft import draft
 from mjx_balance.robots.model import model_path
 from mjx_balance.robots.robot import Robot
 from mjx_balance.robots.schema import RobotError, RobotFile, parse_robot_file, read_robot_file
 
-SHIPPED = Path(__file__).resolve().parent
-OURS = ("quadruped", "quadruped_soft")
 MENAGERIE = "menagerie:"
-
-
-def shipped() -> list[str]:
-    """Returns the names of the robots whose files are part of this package."""
-    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+_IN_PYTHON: dict[str, RobotFile] = {}
 
 
 def makers() -> list[str]:
@@ -31,21 +33,58 @@ def robot_file(name: str) -> RobotFile:
     """Reads or drafts the file of a robot.
 
     Args:
-      name: as `Config.robot`: a shipped robot's name, the path of a TOML file, or `menagerie:NAME`.
+      name: as `Config.robot`: a shipped robot's name, the path of a TOML file, `menagerie:NAME`, or
+        a name that `use_robot` has returned.
 
     Raises:
       RobotError: if there is none, or its file is invalid.
     """
+    if name in _IN_PYTHON:
+        return _IN_PYTHON[name]
     if name.endswith(".toml"):
         return read_robot_file(Path(name))
     if name.startswith(MENAGERIE):
         return _draft_file(name)
     if name not in shipped():
-        raise RobotError(
-            f"robot is {quote(name)}; known robots: {', '.join(shipped())}; or menagerie:NAME, or "
-            "a TOML file"
-        )
+        raise unknown_robot(name)
     return read_robot_file(SHIPPED / f"{name}.toml")
+
+
+def unknown_robot(name: str) -> RobotError:
+    """The error about a robot that is not here."""
+    if ":" in name:
+        return RobotError(
+            f"robot is {quote(name)}, which is made in Python; name it with --robot module:NAME "
+            "(in Python: catalogue.use_robot)"
+        )
+    remedy = suggest("robot", name, shipped())
+    return RobotError(f"robot is {quote(name)}; {remedy}; or menagerie:NAME, or a TOML file")
+
+
+def use_robot(file: RobotFile, name: str | None = None) -> str:
+    """Makes a robot known in this process, and returns its name for `Config.robot`.
+
+    Args:
+      file: e.g. `dataclasses.replace(robot_file("go2"), name="soft_go2", servo_stiffness=60.0)`.
+      name: of the robot in configs; None: the file's own.
+
+    Raises:
+      RobotError: if a field is invalid, or the name is taken by a shipped robot.
+    """
+    name = name or file.name
+    parse(RobotFile, dataclasses.asdict(file), RobotError)
+    if name in shipped() or name.endswith(".toml"):
+        raise RobotError(
+            f"name is {quote(name)}, which is a shipped robot's or a file's; give yours another"
+        )
+    _IN_PYTHON[name] = file
+    return name
+
+
+def in_python(name: str) -> dict[str, Any] | None:
+    """A robot that is made in Python as JSON values, for another process; None for any other."""
+    file = _IN_PYTHON.get(name)
+    return file and json.loads(json.dumps(dataclasses.asdict(file), default=str))
 
 
 @functools.lru_cache(maxsize=8)

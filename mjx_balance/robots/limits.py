@@ -4,20 +4,24 @@ import dataclasses
 import math
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig, TaskConfig
-from mjx_balance.robots.catalogue import find_robot
+from mjx_balance.robots.catalogue import find_robot, use_robot
 from mjx_balance.robots.robot import Body, Robot
+from mjx_balance.robots.schema import RobotFile
 
 
-def for_robot(config: Config, robot: str) -> Config:
+def for_robot(config: Config, robot: str | RobotFile) -> Config:
     """Adapts a config of our own robot to another robot.
 
     Standing height and greatest height change become the robot's (`robots.measure`). Payloads scale
     with its mass; offsets and the scale of foot heights with its size; pushes with the speed from
-    which it tips over. Angles, board rate and fall limit stay.
+    which it tips over. Angles, board rate and fall limit stay. A `RobotFile` made in Python becomes
+    known by its name, in this process (`catalogue.use_robot`).
 
     Raises:
       ConfigError: if there is no such robot.
     """
+    if isinstance(robot, RobotFile):
+        robot = use_robot(robot)
     own = find_robot(robot)
     task = dataclasses.replace(
         config.task,

@@ -3,7 +3,7 @@
 import itertools
 import json
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from mjx_balance.config import Config, ConfigError, sweep_grid
 from mjx_balance.dqn import TrainState
@@ -13,15 +13,31 @@ from mjx_balance.evaluation import rollout as evaluation
 from mjx_balance.evaluation.statistics import over_seeds
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import RunFolder, write_atomically, write_json
-from mjx_balance.policy.file import Policy, PolicyError, load_policy, save_policy
+from mjx_balance.policy.file import PolicyError, load_policy, save_policy
 from mjx_balance.report import tables
 from mjx_balance.training.loop import Run
 from mjx_balance.training.tensorboard import Board
-from mjx_balance.training.validation import Results, best_validated, exports, scalars, score
+from mjx_balance.training.validation import (
+    AnyPolicy,
+    Results,
+    best_validated,
+    exports,
+    greedy_policy,
+    scalars,
+    score,
+)
 
 CHOICE_SCENARIOS = 32  #: scenarios per suite by which one of several seeds is chosen
 DRAWN_BYTES = 2**26  #: of metrics.jsonl; of more, the figures show every second line, third, ...
 FINAL = "final"  #: TensorBoard's folder of the evaluation after training
+
+
+class Finished(NamedTuple):
+    """What a run gives."""
+
+    policy: AnyPolicy  #: of several seeds the best on the validation scenarios
+    evaluation: Results  #: its own: suite name -> JSON of `rollout.summarize`
+    folder: RunFolder
 
 
 def check_fits(config: Config) -> None:
@@ -36,11 +52,12 @@ def check_fits(config: Config) -> None:
             raise ConfigError(f"{kind}_{error}") from error
 
 
-def export(run: Run, state: TrainState, seconds: float) -> list[Policy]:
+def export(run: Run, state: TrainState, seconds: float) -> list[AnyPolicy]:
     """Writes a policy per seed; the first also as the run's, until a better one is known.
 
     A seed's policy is that of the state or, if `config.export` says so, the one that validated
-    best so far. Seeds whose weights are no policy are logged and left out.
+    best so far. Seeds whose weights are no policy are logged and left out. A policy of the user's
+    own network has no file.
 
     Args:
       run: says which policies.
@@ -50,7 +67,7 @@ def export(run: Run, state: TrainState, seconds: float) -> list[Policy]:
     Raises:
       PolicyError: if no seed has a policy.
     """
-    policies = []
+    policies: list[AnyPolicy] = []
     for weights, manifest in exports(run.config, run.learner, run.env.scene, state):
         manifest["training"]["seconds_learning_since_start_or_resume"] = round(seconds, 1)
         try:
@@ -62,12 +79,14 @@ def export(run: Run, state: TrainState, seconds: float) -> list[Policy]:
             f"the run in {run.folder.path} learnt no policy of finite numbers; lower learning_rate"
         )
     if run.num_seeds > 1:
-        _hand_out(run.folder, policies[0])
+        _hand_out(run, policies[0])
     return policies
 
 
-def _export(run: Run, weights: Params, manifest: dict[str, Any]) -> Policy:
+def _export(run: Run, weights: Params, manifest: dict[str, Any]) -> AnyPolicy:
     """Writes the policy of one seed."""
+    if not run.exportable:
+        return greedy_policy(run, weights, manifest)
     folder, seed, best = run.folder, manifest["config"]["seed"], None
     file = folder.seed_policy(seed) if run.num_seeds > 1 else folder.policy
     if run.config.export == "best":
@@ -81,12 +100,14 @@ def _export(run: Run, weights: Params, manifest: dict[str, Any]) -> Policy:
     return policy
 
 
-def _hand_out(folder: RunFolder, policy: Policy) -> None:
+def _hand_out(run: Run, policy: AnyPolicy) -> None:
     """Makes a seed's policy the run's."""
-    write_atomically(folder.policy, folder.seed_policy(policy.config.seed).read_bytes())
+    if run.exportable:
+        file = run.folder.seed_policy(policy.config.seed)
+        write_atomically(run.folder.policy, file.read_bytes())
 
 
-def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
+def finish(run: Run, policies: list[AnyPolicy], start_time: float) -> Finished:
     """Evaluates all seeds, makes the best the run's policy, writes evaluation.json, draws."""
     config, folder, console = run.config, run.folder, run.display.console
     each = [_evaluate(run, policy, config.eval_scenarios, SEEDS.final) for policy in policies]
@@ -95,26 +116,28 @@ def finish(run: Run, policies: list[Policy], start_time: float) -> Results:
         ranked = _ranked(config, policies, each)
         write_json(folder.sweep, ranked)
         tables.print_table(console, tables.sweep_table(ranked))
-    results = each[best]
+    results, policy = each[best], policies[best]
+    if not run.keep:
+        tables.print_table(console, tables.evaluation_table(results))
+        return Finished(policy, results, folder)
     folder.drawing.touch()
     write_json(folder.evaluation, results)  # before the pictures, which may fail
     try:
-        _log(results, policies[best].manifest["training"]["env_steps"], folder)
+        _log(results, policy.manifest["training"]["env_steps"], folder)
         with run.display.phase("drawing figures"):
-            _draw(folder, config.robot)
+            _draw(folder, policy, config.robot)
     except Exception as error:
         reason = shorten(error, MESSAGE) or type(error).__name__
         run.display.say(f"not all figures and curves are there: {reason}")
     folder.drawing.unlink()
     took = time.perf_counter() - start_time
     tables.print_summary(console, folder.path, results, took, config.robot)
-    return results
+    return Finished(policy, results, folder)
 
 
-def _draw(folder: RunFolder, robot: str) -> None:
+def _draw(folder: RunFolder, policy: AnyPolicy, robot: str) -> None:
     from mjx_balance.report import figures, measuring  # matplotlib: not before learning begins
 
-    policy = load_policy(folder.policy)
     stride = 1 + folder.metrics.stat().st_size // DRAWN_BYTES
     with folder.metrics.open(encoding="utf-8") as file:
         lines = [json.loads(line) for line in itertools.islice(file, 0, None, stride)]
@@ -123,7 +146,7 @@ def _draw(folder: RunFolder, robot: str) -> None:
     figures.draw_figures(folder.figures, lines, policy.config.task, scene, {"policy": rollout})
 
 
-def _evaluate(run: Run, policy: Policy, scenarios: int, seed: int) -> Results:
+def _evaluate(run: Run, policy: AnyPolicy, scenarios: int, seed: int) -> Results:
     """Evaluates a policy on every suite."""
     kind = "validating" if seed == SEEDS.validation else "evaluating in plain MuJoCo"
     of_seed = f", seed {policy.config.seed}" if run.num_seeds > 1 else ""
@@ -143,11 +166,11 @@ def _log(results: Results, env_steps: int, folder: RunFolder) -> None:
     Board(folder.tensorboard / FINAL).write(env_steps, scalars(results))
 
 
-def _choose(run: Run, policies: list[Policy], each: list[Results]) -> int:
+def _choose(run: Run, policies: list[AnyPolicy], each: list[Results]) -> int:
     """Validates every seed, makes the best one the run's policy, writes seeds.json."""
     validated = [_evaluate(run, x, CHOICE_SCENARIOS, SEEDS.validation) for x in policies]
     best = min(range(len(policies)), key=lambda k: score(validated[k]))
-    _hand_out(run.folder, policies[best])
+    _hand_out(run, policies[best])
     seeds = [policy.config.seed for policy in policies]
     summary = {suite: over_seeds([results[suite] for results in each]) for suite in HEADLINE}
     rows = [
@@ -161,7 +184,7 @@ def _choose(run: Run, policies: list[Policy], each: list[Results]) -> int:
     return best
 
 
-def _ranked(config: Config, policies: list[Policy], each: list[Results]) -> list[dict[str, Any]]:
+def _ranked(config: Config, policies: list[AnyPolicy], each: list[Results]) -> list[dict[str, Any]]:
     """The statistics of each combination of swept values, by falls, then by mean tilt."""
     rows = []
     for number, values in enumerate(sweep_grid(config)):

@@ -22,6 +22,7 @@ from mjx_balance.envs.balance import BalanceEnv, Metric
 from mjx_balance.files.run_folder import RunFolder, keep_metrics_until, keep_validated_until
 from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints
+from mjx_balance.training.callbacks import Callbacks
 from mjx_balance.training.processes import ALONE, Processes, exit_at_once
 from mjx_balance.training.tensorboard import Board
 
@@ -56,6 +57,15 @@ class Run:
     folder: RunFolder
     display: Display
     processes: Processes = ALONE
+    callbacks: Callbacks = dataclasses.field(default_factory=Callbacks)
+    own: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
+    """Names of the user's own `network` and `loss`; None or missing: ours."""
+    keep: bool = True  #: whether the folder stays after the run, so that files in it have readers
+
+    @property
+    def exportable(self) -> bool:
+        """Whether the network is ours, which a policy file describes and NumPy runs."""
+        return self.own.get("network") is None
 
     @property
     def num_seeds(self) -> int:
@@ -79,13 +89,14 @@ class Run:
 
 
 class Interrupts:
-    """Reasons to stop: an interrupt of the user, or a write that failed.
+    """Reasons to stop: an interrupt of the user, a write that failed, or a callback's wish.
 
     A second interrupt raises at once. A terminal that closes interrupts too (SIGHUP), unless the
     user has said `nohup`.
     """
 
     failure: str | None = None  #: what could not be written
+    by_callback = False  #: whether a callback wants the run to end here
 
     def __init__(self, log_fn: Callable[[str], None]):
         """Answers by `log_fn`; use as a context."""
@@ -93,6 +104,11 @@ class Interrupts:
 
     def __bool__(self) -> bool:
         """Whether there is one."""
+        return self.interrupted or self.by_callback
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the run is not to go on to its evaluation."""
         return self._first is not None or self.failure is not None
 
     @contextmanager
@@ -161,7 +177,7 @@ def _leave(call: Future[Any]) -> None:
 def learn(
     run: Run, program: Program, state: TrainState, stop: Interrupts, validate: Validate
 ) -> tuple[TrainState, float]:
-    """Calls the program until the last decision, or until the user or a full disk stops it.
+    """Calls the program until the last decision, or until user, callback or full disk stop it.
 
     The state is saved either way; what cannot be written is noted in `stop`.
 
@@ -184,8 +200,9 @@ def learn(
             done = number(state.env_steps)
             if write is not None:
                 metrics, seeds = measured(run, raw, elapsed)
+                validated = validation_due(run, before, done)
                 with stop.saving(run.folder.path):
-                    if validation_due(run, before, done):
+                    if validated:
                         began = time.perf_counter()
                         held_out = stop.run(validate, state)
                         validating += time.perf_counter() - began
@@ -193,6 +210,7 @@ def learn(
                         metrics["perf/validation_share"] = validating / (seconds + validating)
                         seeds |= listed(held_out)
                     write(state, metrics, seeds)
+                stop.by_callback |= _tell(run, state, metrics, validated)
             due = time.monotonic() - saved_at >= run.config.checkpoint_seconds
             if stop.run(any_process, due):
                 with stop.saving(run.folder.path):
@@ -201,6 +219,17 @@ def learn(
     with stop.saving(run.folder.path):
         checkpoints.save(run.folder.checkpoints, done, state, run.processes)
     return state, seconds
+
+
+def _tell(run: Run, state: TrainState, metrics: dict[str, float], validated: bool) -> bool:
+    """Tells the callbacks of a line of metrics; whether one wants to stop."""
+    line = _steps(state) | metrics
+    stop = validated and run.callbacks.on_validation(line)
+    return run.callbacks.on_log(line) or stop
+
+
+def _steps(state: TrainState) -> dict[str, int]:
+    return {name: number(getattr(state, name)) for name in ("env_steps", "gradient_steps")}
 
 
 @contextmanager
@@ -215,7 +244,7 @@ def _journal(run: Run, done: int) -> Iterator[Callable[..., None]]:
     with run.display.training(done, run.total):
 
         def write(state: TrainState, metrics: dict[str, float], seeds: dict[str, Any]) -> None:
-            steps = {name: number(getattr(state, name)) for name in ("env_steps", "gradient_steps")}
+            steps = _steps(state)
             by_seed = {"seeds": seeds} if run.num_seeds > 1 else {}
             with folder.metrics.open("a") as log:
                 log.write(json.dumps(steps | metrics | by_seed) + "\n")

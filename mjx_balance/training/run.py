@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +11,20 @@ import jax
 
 from mjx_balance.config import Config, ConfigError, flatten, to_dict
 from mjx_balance.config.serialization import check_same_config, read_run_config
-from mjx_balance.dqn import DQN, TrainState
+from mjx_balance.dqn import DQN, Loss, Network, TrainState
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.errors import shell
 from mjx_balance.files import run_folder
 from mjx_balance.files.run_folder import RunFolder, RunFolderError, RunFolderExistsError
 from mjx_balance.machine import cores
-from mjx_balance.policy.file import Policy, PolicyError
+from mjx_balance.policy.file import PolicyError
 from mjx_balance.report.progress import Display
 from mjx_balance.sim.engines.table import ENGINES
 from mjx_balance.training import checkpoints, finish, profiling, program_cache, sizing
+from mjx_balance.training.callbacks import Callback, Callbacks, LogFunction
 from mjx_balance.training.loop import Interrupts, Program, Run, learn, number
 from mjx_balance.training.processes import Cluster, Interrupted, Processes, joined
-from mjx_balance.training.validation import validate
+from mjx_balance.training.validation import AnyPolicy, validate
 
 SHARED = (ConfigError, RunFolderError, checkpoints.CheckpointError, PolicyError)
 """Errors that all processes of a run raise together."""
@@ -36,35 +37,57 @@ def train(
     display: Display,
     cluster: Cluster | None = None,
     profile: bool = False,
-) -> finish.Results | None:
+    *,
+    callbacks: Iterable[Callback | LogFunction] = (),
+    network: Network | None = None,
+    loss: Loss | None = None,
+    keep: bool = True,
+) -> finish.Finished | None:
     """Runs or continues a training and everything that follows it.
 
     A new run has the folder `run_dir`, or one named after preset, seed and time; `resume` is the
     folder of a run to continue, with the same config. Of several processes (`cluster`) the first
-    one writes, shows and evaluates. `profile` traces a call of the training program and sums it up.
+    one writes, shows and evaluates, and calls the `callbacks`. `profile` traces a call of the
+    training program and sums it up. `network` and `loss` replace ours, as in `sizing.make_learner`.
+    Without `keep`, no figures are drawn in the folder.
 
-    Returns the evaluation, suite name -> JSON of `rollout.summarize`; None in the other processes.
+    Returns policy, evaluation and folder; None in the other processes.
     Raises `ConfigError`, `RunFolderError`, `CheckpointError` or `ProcessError` for what cannot be
     used, `PolicyError` if no seed learnt finite numbers, `Interrupted` if the user stopped the run.
     """
-    start_time = time.perf_counter()
+    start_time, listeners = time.perf_counter(), Callbacks(callbacks)
     with jax.enable_x64(False), joined(cluster, SHARED) as processes:
         sizing.configure_jax(display.say, _num_cores(config, resume, processes))
-        sized, env, learner = processes.run_on_all(lambda: _set_up(config), ConfigError)
+        sized, env, learner = processes.run_on_all(
+            lambda: _set_up(config, network, loss), ConfigError
+        )
         if growth := sizing.describe_growth(config, sized):
             display.say(growth)
-        today = provenance(env)
+        own = {"network": network and type(network).__name__, "loss": loss and _name(loss)}
+        today = provenance(env) | own
         flags = flatten(to_dict(sized)) | {"run_dir": str(run_dir), "resume": str(resume)}
         processes.check_same(flags | today)
         path = processes.broadcast(
             lambda: str(_open_folder(sized, today, run_dir, resume, display)), RunFolderError
         )
-        run = Run(sized, env, learner, RunFolder(Path(path)), display, processes)
+        if not processes.first:
+            listeners = Callbacks()
+        folder = RunFolder(Path(path))
+        run = Run(sized, env, learner, folder, display, processes, listeners, own, keep)
         _announce(run)
-        with _locked(run):
+        with _locked(run), contextlib.closing(listeners):
+            listeners.on_start(sized, folder.path)
             policies = _learn(run, profile)
             processes.leave()  # what follows takes minutes of one process, and no device
-            return finish.finish(run, policies, start_time) if processes.first else None
+            if not processes.first:
+                return None
+            finished = finish.finish(run, policies, start_time)
+            listeners.on_end(finished.evaluation)
+            return finished
+
+
+def _name(function: Loss) -> str:
+    return getattr(function, "__name__", type(function).__name__)
 
 
 def _num_cores(config: Config, resume: Path | None, processes: Processes) -> int:
@@ -73,14 +96,16 @@ def _num_cores(config: Config, resume: Path | None, processes: Processes) -> int
     return max(processes.cores or cores(), had)
 
 
-def _set_up(config: Config) -> tuple[Config, BalanceEnv, DQN]:
+def _set_up(
+    config: Config, network: Network | None, loss: Loss | None
+) -> tuple[Config, BalanceEnv, DQN]:
     """Sizes a run to the devices; envs that nobody asked for are halved until they fit."""
     most = None
     while True:
         sized = sizing.size_to_device(config, most)
         finish.check_fits(sized)
         env = BalanceEnv(sized)
-        learner = sizing.make_learner(sized, env)
+        learner = sizing.make_learner(sized, env, network, loss)
         try:
             sizing.check_memory(learner)
             return sized, env, learner
@@ -160,7 +185,7 @@ def _locked(run: Run) -> Iterator[None]:
             ) from error
 
 
-def _learn(run: Run, profile: bool) -> list[Policy]:
+def _learn(run: Run, profile: bool) -> list[AnyPolicy]:
     """Learns to the last decision and exports; the first process alone gets the policies."""
     processes, folder = run.processes, run.folder
     with Interrupts(run.display.say) as stop:
@@ -172,10 +197,10 @@ def _learn(run: Run, profile: bool) -> list[Policy]:
             lambda: finish.export(run, state, seconds) if processes.first else [], PolicyError
         )
         resume = f"continue with --resume {shell(folder.path)}"
-        so_far = f"the policy so far is {folder.policy}; {resume}"
+        so_far = f"the policy so far is {folder.policy}; {resume}" if run.exportable else resume
         if failure := next(filter(None, processes.gather(stop.failure)), None):
             raise checkpoints.SaveError(f"{failure}; {so_far}")
-        if processes.any(bool(stop)):
+        if processes.any(stop.interrupted):
             raise Interrupted(f"stopped at {number(state.env_steps):,} decisions; {so_far}")
     return policies
 
@@ -195,7 +220,7 @@ def prepare(run: Run, stop: Interrupts, profile: bool = False) -> tuple[TrainSta
             key = None
             if profile:  # caches keep no names to profile by
                 jax.config.update("jax_enable_compilation_cache", False)
-            elif ENGINES[run.config.engine].cacheable:
+            elif ENGINES[run.config.engine].cacheable and not any(run.own.values()):
                 key = program_cache.program_key(run.config, run.iterations, sizing.__name__)
             program = stop.run(program_cache.compile_program, program, state, key, say)
     processes.gather(None)  # whoever compiles longest is awaited here, where nothing times out

@@ -11,10 +11,10 @@ import jax
 from jax.sharding import PartitionSpec
 
 from mjx_balance.config import Config, ConfigError, check, expand_runs, preset, sweep_grid
-from mjx_balance.dqn import DQN, DQNSpec, QNetwork
+from mjx_balance.dqn import DQN, DQNSpec, Loss, Network, QNetwork
 from mjx_balance.dqn.mesh import REPLICATED
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.errors import quote, shorten
+from mjx_balance.errors import MESSAGE, quote, shorten
 from mjx_balance.files.run_folder import write_json
 from mjx_balance.machine import available_memory, cores, share_heap
 from mjx_balance.policy.manifest import network_factors
@@ -156,8 +156,20 @@ def _device(engine: str) -> str:
     return f"{jax.devices()[0].device_kind}, engine {engine}"
 
 
-def make_learner(config: Config, env: BalanceEnv) -> DQN:
-    """The DQN for a config that `size_to_device` has completed."""
+def make_learner(
+    config: Config, env: BalanceEnv, network: Network | None = None, loss: Loss | None = None
+) -> DQN:
+    """The DQN for a config that `size_to_device` has completed.
+
+    Args:
+      config: of the run.
+      env: of the run.
+      network: the user's own; None: that of the config.
+      loss: the user's own, of a transition; None: the DQN's.
+
+    Raises:
+      ConfigError: if the network is none for this env and config.
+    """
     assert config.num_envs is not None
     assert config.num_devices is not None
     runs, processes = expand_runs(config), jax.process_count()
@@ -174,8 +186,57 @@ def make_learner(config: Config, env: BalanceEnv) -> DQN:
         first_reset=env.reset_staggered,
         sweep={name: [getattr(run.dqn, name) for run in runs] for name in sweep_grid(config)[0]},
     )
-    radial = config.dqn.head == "radial"
-    return DQN(env, QNetwork(config.dqn.hidden_sizes, network_factors(config), radial), spec)
+    if network is None:
+        radial = config.dqn.head == "radial"
+        network = QNetwork(config.dqn.hidden_sizes, network_factors(config), radial)
+    else:
+        check_network(network, config, env)
+    return DQN(env, network, spec, loss)
+
+
+def check_network(network: Network, config: Config, env: BalanceEnv) -> None:
+    """Checks a network that is not ours before anything is written.
+
+    Raises:
+      ConfigError: if it cannot be called, or its values or methods are not what the config needs.
+    """
+    name, size, count = type(network).__name__, env.observation_size, config.task.num_actions
+    if config.export == "best":
+        raise ConfigError(
+            f"export is 'best', but network {name} is your own, so that no policy file is written "
+            "to choose from; export must be 'last'"
+        )
+    for field, on, method in (
+        ("action", config.task.action == "continuous", "head"),
+        ("zero_at_rest", config.dqn.zero_at_rest, "fold_rest"),
+    ):
+        if on and not hasattr(network, method):
+            value = getattr(config.task if field == "action" else config.dqn, field)
+            other = "'grid'" if field == "action" else "False"
+            raise ConfigError(
+                f"{field} is {quote(value)}, for which network {name} needs a method `{method}` "
+                f"(dqn.Network); give it one, or set {field} to {other}"
+            )
+    obs = jax.ShapeDtypeStruct((size,), "float32")
+
+    def values(obs: jax.Array) -> Any:
+        params = network.init(jax.random.PRNGKey(0), obs)
+        if hasattr(network, "head"):
+            return network.apply(params, obs, method="head").q_values()
+        return network.apply(params, obs)
+
+    try:
+        shape = jax.eval_shape(values, obs).shape
+    except Exception as error:  # whatever the network makes of it
+        reason = shorten(error, MESSAGE // 2)
+        raise ConfigError(
+            f"network {name} fails for an observation of shape ({size},): {reason}"
+        ) from error
+    if shape != (count,):
+        raise ConfigError(
+            f"network {name} gives values of shape {shape} for an observation of shape ({size},); "
+            f"it must be ({count},), one per action"
+        )
 
 
 def check_memory(learner: DQN) -> None:

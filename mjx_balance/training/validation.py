@@ -19,7 +19,9 @@ from mjx_balance.policy.manifest import PolicyError, make_manifest
 from mjx_balance.policy.network import Policy
 from mjx_balance.sim.scene import Scene
 from mjx_balance.training.loop import Run, number
+from mjx_balance.training.own_policy import OwnPolicy
 
+AnyPolicy = Policy | OwnPolicy  #: of our network, or of the user's own
 Results = dict[str, dict[str, Any]]  #: suite name -> JSON of `rollout.summarize`
 
 
@@ -58,6 +60,13 @@ def exports(
         yield jax.device_get(learner.export_params(mine)), manifest
 
 
+def greedy_policy(run: Run, weights: Params, manifest: dict[str, Any]) -> AnyPolicy:
+    """A seed's greedy policy; raises `PolicyError` for weights that are none."""
+    if run.exportable:
+        return Policy(manifest, flat_weights(weights))
+    return OwnPolicy(run.learner, weights, manifest)
+
+
 def validate(run: Run, state: TrainState) -> dict[str, np.ndarray]:
     """Validates and saves every seed's greedy policy; changes nothing of the state.
 
@@ -75,7 +84,7 @@ def validate(run: Run, state: TrainState) -> dict[str, np.ndarray]:
 def _validate(run: Run, weights: Params, manifest: dict[str, Any]) -> dict[str, float]:
     """The `scalars` of one policy; empty if the weights are none."""
     try:
-        policy = Policy(manifest, flat_weights(weights))
+        policy = greedy_policy(run, weights, manifest)
     except PolicyError:  # the seed has diverged; the end of the run says so
         return {}
     count, duration = run.config.validation_scenarios, run.config.validation_duration
@@ -83,6 +92,8 @@ def _validate(run: Run, weights: Params, manifest: dict[str, Any]) -> dict[str, 
     for suite in HEADLINE:
         rollout = run_suite(run.env.scene, act, suite, count, duration, SEEDS.validation)
         results[suite] = summarize(rollout, suite, duration, SEEDS.validation)
+    if not run.exportable:
+        return scalars(results)
     training = manifest["training"]
     training["validation"] = results
     file = run.folder.validated_policy(policy.config.seed, training["env_steps"])

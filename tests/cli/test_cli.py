@@ -59,7 +59,10 @@ def refuse(capsys: pytest.CaptureFixture[str], *arguments: str, wanted: int = 2)
     ("flags", "named"),
     [
         ("--preset huge", "unknown preset 'huge'; known presets: paper, default, best"),
-        ("--warp-speed 9", "--warp-speed"),
+        ("--warp-speed 9", "unknown flag --warp-speed; `mjx-balance train --help-all` lists"),
+        ("--num_env 64", "unknown flag --num-env; did you mean --num-envs?"),
+        ("--preset quik", "unknown preset 'quik'; did you mean quick?"),
+        ("--robot go3", "robot is 'go3'; did you mean go2?"),
         ("--gamma much", "--gamma"),
         ("--gamma 1.5", "gamma is 1.5"),
         ("--target-period 3", "target_period is 3.0 s"),
@@ -109,7 +112,8 @@ def test_no_training_ends_in_a_traceback(
     monkeypatch.setattr(run, "train", mock.Mock(side_effect=error))
     assert main(["train", "--preset", "smoke"]) == code
     shown = capsys.readouterr()
-    assert " ".join((shown.out + shown.err).split()) == said
+    first = "preset smoke: importing JAX and MuJoCo ..."
+    assert " ".join((shown.out + shown.err).split()) == f"{first} {said}".strip()
 
 
 def test_flags_start_from_the_preset_or_from_the_resumed_run(
@@ -201,6 +205,9 @@ def test_what_cannot_be_resumed_is_refused(
         ("evaluate text --controller none", "name a policy file or --controller NAME"),
         ("evaluate --controller lqr", "unknown controller 'lqr'; known controllers: none"),
         ("evaluate --controller none --suite moon", "unknown suite 'moon'; known suites: paper"),
+        ("evaluate best --suite cornr", "unknown suite 'cornr'; did you mean corner?"),
+        ("evaluate --controller=pd-imo", "unknown controller 'pd-imo'; did you mean pd-imu?"),
+        ("sweep gamma=0.1,0.2 --preset quik", "unknown preset 'quik'; did you mean quick?"),
         ("evaluate text --json no/such/out.json", "cannot write no/such/out.json"),
         ("evaluate --controller none --json .", "cannot write .: it is a folder"),
         ("evaluate --controller none --video text", "video is text; its name must"),
@@ -214,7 +221,10 @@ def test_what_cannot_be_resumed_is_refused(
         ("report nowhere", "nowhere is no folder"),
         ("report . --out no/such.html", "cannot write no/such.html: its folder does"),
         ("robot", "Expected one of {check, new}"),
-        ("robot buy", "Available subcommands: check, new"),
+        ("robot buy", "unknown command 'robot buy'; known commands: check, new"),
+        ("robot chekc", "unknown command 'robot chekc'; did you mean check?"),
+        ("evalute best", "unknown command 'evalute'; did you mean evaluate?"),
+        ("completion cmd", "unknown shell 'cmd'; known shells: bash, zsh, fish"),
         ("robot check none.toml", "no robot file at none.toml"),
         ("robot check none.toml --picture no/such.png", "cannot write no/such.png: its folder"),
         ("robot check none.toml --picture rex.jpg", "is rex.jpg; its name must end in .png"),

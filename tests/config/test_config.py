@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import hashlib
 import json
+import re
 import subprocess
 import sys
 import typing
@@ -276,7 +277,7 @@ def test_every_number_has_its_bounds_tested() -> None:
         ({"head": "round"}, "head is 'round'; it must be one of joint, factored, radial"),
         ({"export": "first"}, "export is 'first'; it must be one of last, best"),
         ({"export": "best", "eval_every": 0}, "export is 'best', but eval_every is 0"),
-        ({"preset": "papr"}, "'papr'; known presets: paper, default, best, real, quick, smoke"),
+        ({"preset": "papr"}, "'papr'; did you mean paper?"),
         (
             {"friction_min": 0.9, "friction_max": 0.8},
             "friction_max is 0.8; it must not be less than friction_min, 0.9",
@@ -462,3 +463,35 @@ def test_the_last_seed_of_a_sweep_counts() -> None:
     check(config)
     with pytest.raises(ConfigError, match="the last of all seeds must be less than"):
         check(changed(config, seed=config.seed + 1))
+
+
+def test_names_of_fields_are_unique() -> None:
+    """So that `Config.replace`, flags and `flatten` need no section."""
+    names = [
+        field.name for kind in (*SECTIONS.values(), Config) for field in dataclasses.fields(kind)
+    ]
+    assert len(set(names)) == len(names)
+
+
+def test_a_field_is_replaced_by_its_name_alone() -> None:
+    config = preset("best").replace(reward_toward=0.5, gamma=0.2, seed=7, hidden_sizes=[8, 4])
+    expected = changed(preset("best"), reward_toward=0.5, gamma=0.2, seed=7, hidden_sizes=(8, 4))
+    assert config == check(expected)
+    assert preset("best").replace() == preset("best")
+    both = preset("best").replace(task=TaskConfig(reward_fail=-3.0), reward_toward=0.7)
+    assert both.task == TaskConfig(reward_fail=-3.0, reward_toward=0.7)
+    assert both.dqn == preset("best").dqn
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("reward_towards", "unknown field 'reward_towards'; did you mean reward_toward?"),
+        ("push_maximum", "unknown field 'push_maximum'; did you mean push_max?"),
+        ("learning_rat", "did you mean learning_rate?"),
+        ("nume_envs", "did you mean num_envs?"),
+    ],
+)
+def test_a_field_that_does_not_exist_is_not_replaced(name: str, sentence: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(sentence)):
+        preset("paper").replace(**{name: 1, "gamma": 0.5})

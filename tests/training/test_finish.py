@@ -18,16 +18,17 @@ from mjx_balance.files.run_folder import RunFolder, RunFolderError, unfinished_r
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.report import figures, measuring
 from mjx_balance.training import finish
+from mjx_balance.training.validation import AnyPolicy
 
 CONFIG = preset("smoke")
 SEED = CONFIG.seed
 
 
 @pytest.fixture
-def export(make_run: Any, stub_learner: Any) -> Callable[..., list[Policy]]:
+def export(make_run: Any, stub_learner: Any) -> Callable[..., list[AnyPolicy]]:
     """Scales of the stub's parameters -> policies."""
 
-    def export(*scales: float) -> list[Policy]:
+    def export(*scales: float) -> list[AnyPolicy]:
         run = make_run(dataclasses.replace(CONFIG, num_seeds=len(scales)))
         return finish.export(run, stub_learner.state_of(*scales), 1.26)
 
@@ -117,8 +118,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
             falls, mean = 7, 1 - mean
         return result(suite, falls, mean, seed)
 
-    def draw(folder: RunFolder, robot: str) -> None:
+    def draw(folder: RunFolder, policy: Policy, robot: str) -> None:
         assert robot == CONFIG.robot
+        assert load_policy(folder.policy).fingerprint == policy.fingerprint
         assert folder.evaluation.exists()
         asked.append(("figures", load_policy(folder.policy).config.seed))
 
@@ -137,7 +139,7 @@ def finished(make_run: Any, export: Any, calls: list[Any]) -> Callable[..., dict
         num_seeds = len(scales) // 2 if sweep else len(scales)
         config = dataclasses.replace(CONFIG, num_seeds=num_seeds, sweep=sweep)
         config = dataclasses.replace(config, eval_scenarios=4, eval_duration=5.0)
-        return finish.finish(make_run(config), policies, 0.0)
+        return finish.finish(make_run(config), policies, 0.0).evaluation
 
     return finished
 
@@ -196,7 +198,7 @@ def test_figures_are_of_the_metrics_and_of_a_scenario_of_their_own(
     monkeypatch.setattr(measuring, "record_rollout", record)
     monkeypatch.setattr(figures, "draw_figures", lambda *given: drawn.append(given))
     monkeypatch.setattr(finish.evaluation, "policy_scene", lambda policy, robot: robot)
-    finish._draw(folder, "rex.toml")
+    finish._draw(folder, policy, "rex.toml")
     rollouts = {"policy": (policy.fingerprint, "rex.toml", "paper", 100.0, 2_000_000)}
     lines = [{"env_steps": 1}, {"env_steps": 2}]
     assert drawn == [(folder.figures, lines, CONFIG.task, "rex.toml", rollouts)]

@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -19,11 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_balance.config import PRESETS, Config
+from mjx_balance.config import PRESETS, Config, ConfigError
 from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.files.run_folder import RunFolder, RunFolderError
 from mjx_balance.training import checkpoints, loop
 from mjx_balance.training import run as run_module
+from mjx_balance.training.callbacks import Callback, Callbacks
 from mjx_balance.training.loop import STOPPING, Interrupts, Run, learn, measured
 from mjx_balance.training.program_cache import program_key
 
@@ -73,9 +74,15 @@ def go(folder: RunFolder, display: Any) -> Callable[..., tuple[State, float]]:
     """
 
     def go(
-        program: Any = step, validate: loop.Validate = never, **changes: Any
+        program: Any = step,
+        validate: loop.Validate = never,
+        callbacks: Iterable[Any] = (),
+        **changes: Any,
     ) -> tuple[Any, float]:
-        run = dataclasses.replace(run_of(**changes), folder=folder, display=display)
+        listeners = Callbacks(callbacks)
+        run = dataclasses.replace(
+            run_of(**changes), folder=folder, display=display, callbacks=listeners
+        )
         zero = start(run.num_seeds)
         state = checkpoints.restore(folder.checkpoints, zero, pytest.fail) or zero
         with Interrupts(display.say) as stop:
@@ -629,3 +636,86 @@ def test_a_run_begins_at_its_newest_checkpoint(
     assert len(keys) == 1, "a complete run needs no program"
     shutil.rmtree(folder.checkpoints)
     assert go_on() == 15  # four calls from nothing
+
+
+class Listener(Callback):
+    """Notes what it hears; stops at a number of decisions."""
+
+    def __init__(self, stop_log: int = 0, stop_validation: int = 0):
+        self.heard: list[tuple[str, float]] = []
+        self.stop_log, self.stop_validation = stop_log, stop_validation
+
+    def on_log(self, metrics: Any) -> bool:
+        self.heard.append(("log", metrics["env_steps"]))
+        return metrics["env_steps"] == self.stop_log
+
+    def on_validation(self, metrics: Any) -> bool:
+        assert metrics["eval/paper/falls"] == 0
+        self.heard.append(("validation", metrics["env_steps"]))
+        return metrics["env_steps"] == self.stop_validation
+
+
+def test_callbacks_hear_of_every_line_and_validation(go: Any, folder: RunFolder) -> None:
+    lines: list[Any] = []
+    listener = Listener()
+    validate = lambda state: {"eval/paper/falls": np.zeros(1)}  # noqa: E731
+    go(validate=validate, eval_every=40, callbacks=[listener, lambda x: lines.append(dict(x))])
+    logs = [("log", n) for n in CALLS]
+    validations = [("validation", n) for n in (40, 80, 100)]
+    assert listener.heard == sorted(logs + validations, key=lambda x: (x[1], x[0] == "log"))
+    assert lines == logged(folder)
+
+
+@pytest.mark.parametrize("kind", ["stop_log", "stop_validation"])
+def test_a_callback_ends_a_run_after_its_call(
+    kind: str, go: Any, folder: RunFolder, display: Any
+) -> None:
+    """Every other callback hears of that call too, and the state is saved."""
+    first, second = Listener(**{kind: 40}), Listener()
+    validate = lambda state: {"eval/paper/falls": np.zeros(1)}  # noqa: E731
+    state, _ = go(validate=validate, eval_every=40, callbacks=[first, second])
+    assert int(state.env_steps) == 40
+    assert first.heard == second.heard == [("log", 20), ("validation", 40), ("log", 40)]
+    assert checkpoints.saved_steps(folder.checkpoints) == [40]
+    assert STOPPING not in display.lines
+
+
+def test_a_run_that_a_callback_ends_is_evaluated(
+    folder: RunFolder, display: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It counts as finished, unlike one that the user interrupts."""
+    listeners = Callbacks([lambda metrics: True])
+    run = dataclasses.replace(run_of(), folder=folder, display=display, callbacks=listeners)
+    monkeypatch.setattr(run_module, "prepare", lambda *given: (start(), step))
+    monkeypatch.setattr(run_module.finish, "export", lambda *given: ["the policy"])
+    assert run_module._learn(run, False) == ["the policy"]
+    assert [line["env_steps"] for line in logged(folder)] == [20]
+
+
+def test_what_a_callback_raises_ends_the_run_at_once(go: Any, folder: RunFolder) -> None:
+    def prune(metrics: Any) -> None:
+        if metrics["env_steps"] == 40:
+            raise LookupError("pruned")
+
+    with pytest.raises(LookupError, match="pruned"):
+        go(callbacks=[prune])
+    assert [line["env_steps"] for line in logged(folder)] == [20, 40]
+
+
+def test_all_callbacks_are_closed_though_one_fails() -> None:
+    closed: list[int] = []
+
+    class Closing(Callback):
+        def __init__(self, number: int):
+            self.number = number
+
+        def close(self) -> None:
+            closed.append(self.number)
+            if self.number == 1:
+                raise OSError("no network")
+
+    with pytest.raises(OSError, match="no network"):
+        Callbacks([Closing(0), Closing(1), Closing(2)]).close()
+    assert closed == [0, 1, 2]
+    with pytest.raises(ConfigError, match="callbacks has 3; each must be a Callback, or a func"):
+        Callbacks([3])  # pyright: ignore[reportArgumentType]
