@@ -13,7 +13,7 @@ from mjx_balance.config import Config, ConfigError, flatten, to_dict
 from mjx_balance.config.serialization import check_same_config, read_run_config
 from mjx_balance.dqn import DQN, Loss, Network, TrainState
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.errors import shell
+from mjx_balance.errors import nearby, shell
 from mjx_balance.files import run_folder
 from mjx_balance.files.run_folder import RunFolder, RunFolderError, RunFolderExistsError
 from mjx_balance.machine import cores
@@ -164,7 +164,7 @@ def _announce(run: Run) -> None:
     last = config.seed + run.num_seeds - 1
     seeds = f"seed {last}" if last == config.seed else f"seeds {config.seed} to {last}"
     run.display.say(
-        f"{path}: preset {config.preset}, {seeds}, {config.num_envs} envs on "
+        f"{nearby(path)}: preset {config.preset}, {seeds}, {config.num_envs} envs on "
         f"{config.num_devices} {jax.devices()[0].device_kind} device(s)"
     )
 

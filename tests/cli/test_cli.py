@@ -151,16 +151,17 @@ def test_a_process_among_several_is_quiet_but_for_the_first(
 def test_a_report_is_of_what_was_asked_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """64 scenarios into the first folder, or what the flags say; what is missing is said."""
+    """8 scenarios into the first folder, or what the flags say; what is missing is said."""
     asked: list[Any] = []
     monkeypatch.setattr(
         "mjx_balance.report.page.write_report",
-        lambda *given: asked.append(given[:3]) or ["no video"],
+        lambda *given: asked.append((*given[:3], given[5])) or ["no video"],
     )
     assert main(["report", "a", "b"]) == 0
-    assert main("report a --out page.html --scenarios 5".split()) == 0
+    assert main("report a --out page.html --scenarios 5 --no-video".split()) == 0
     a, b = Path("a"), Path("b")
-    assert asked == [((a, b), a / "report.html", 64), ((a,), Path("page.html"), 5)]
+    first, second = ((a, b), a / "report.html", 8, True), ((a,), Path("page.html"), 5, False)
+    assert asked == [first, second]
     said = capsys.readouterr()
     assert said.out.split() == ["a/report.html", "page.html"]
     assert said.err == 2 * "mjx-balance: no video\n"
