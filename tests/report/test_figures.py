@@ -118,7 +118,7 @@ def test_learning_curves_show_validations_as_points_beside_the_tilt() -> None:
     np.testing.assert_allclose(data(axes[0], 2), [(2, 0.75)])
     assert [line.get_linestyle() for line in axes[0].get_lines()] == ["-", "None", "None"]
     legend = axes[0].get_legend().get_texts()
-    assert [x.get_text() for x in legend] == ["held out, paper", "held out, corner"]
+    assert [x.get_text() for x in legend] == ["exploring", "held out, paper", "held out, corner"]
     assert [len(axis.get_lines()) for axis in axes] == [3, 1, 1, 1, 1, 1]
     bare = figures.learning_curves([[metrics_line(1_000, [1.0] * 6)]]).axes[0]
     assert bare.get_legend() is None
@@ -148,9 +148,8 @@ def test_tilt_figure_shows_the_share_beyond_each_tilt() -> None:
     np.testing.assert_allclose(policy[:, 1], [0.5, 0.2, np.nan, np.nan])
     np.testing.assert_allclose(none[:, 1], [1.0, 1.0, 1.0, np.nan])
     labels = {text.get_text(): text for text in axis.texts}
-    assert list(labels) == ["none", "policy"], "the farthest curve is labelled on top"
-    heights = [text.get_position()[1] for text in axis.texts]
-    assert heights[0] > heights[1] + 0.08, "no label covers another"
+    heights = {name: label.get_position()[1] for name, label in labels.items()}
+    assert heights["none"] > heights["policy"] + 0.08, "the farthest on top, none over another"
     for name, line in zip(("policy", "none"), axis.get_lines()[:2], strict=True):
         assert labels[name].get_color() == line.get_color()
         assert labels[name].xy in [tuple(point) for point in np.asarray(line.get_xydata())]
@@ -251,7 +250,7 @@ def test_rollout_figure_shows_each_angle_in_its_row(config: Config, scene: Scene
     assert [axis.get_ylabel() for axis in figure.axes] == [
         *("board [deg]", "body roll [deg]", "body pitch [deg]", "tilt [deg]")
     ]
-    assert [text.get_text() for text in board.texts] == ["Y", "X"]
+    assert {text.get_text() for text in board.texts} == {"X", "Y"}
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == [
         f"standing still (the board's tilt): mean {still.mean():.2f}, max {still.max():.2f} deg",
