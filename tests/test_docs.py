@@ -281,7 +281,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     for owner, name, value in (
         (evaluate_command, "run_suite", few),
         (evaluation, "policy_scene", scene_of),
-        (render, "write", lambda path, *_: path.write_bytes(b"")),
+        (render, "write", lambda path, *_, **how: path.write_bytes(b"")),
         (render, "Window", mock.MagicMock(return_value=shut)),
         (run, "train", lambda wanted, *_: config.check(wanted)),
         (ppo, "train", train_ppo),

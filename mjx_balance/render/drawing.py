@@ -81,7 +81,7 @@ def write(
                     for step in range(0, len(qpos), stride):
                         picture = painter.draw(qpos[step])
                         writer.append_data(_inscribed(picture, *captions[step : step + 1]))
-                        progress((step + stride) / (len(qpos) + stride))
+                        progress(min((step + stride) / len(qpos), 1.0))
             write_atomically(path, file.read_bytes())
     except RenderError:
         raise

@@ -2,7 +2,6 @@
 
 import atexit
 import dataclasses
-import functools
 import json
 import math
 import signal
@@ -20,7 +19,6 @@ import numpy as np
 from mjx_balance.config import Config, expand_runs
 from mjx_balance.dqn import DQN, TrainState
 from mjx_balance.envs.balance import BalanceEnv, Metric
-from mjx_balance.evaluation.suites import HEADLINE, SEEDS, standing_still
 from mjx_balance.files.run_folder import RunFolder, keep_metrics_until, keep_validated_until
 from mjx_balance.report.progress import Display
 from mjx_balance.training import checkpoints
@@ -36,7 +34,6 @@ LEARNER_METRICS = {
     "diverged": Metric(per="call"),
 }
 """The learner's own metrics; an env's table is added to them."""
-STILL_SCENARIOS = 32  #: per suite, by which a robot that stands still is judged
 ANSWER_S = 0.2  #: longest time that the user waits for an answer to an interrupt, s
 AGAIN_S = 1.0  #: signals within this time are one interrupt: schedulers send several at once, s
 STOPPING = (
@@ -64,6 +61,8 @@ class Run:
     own: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
     """Names of the user's own `network` and `loss`; None or missing: ours."""
     keep: bool = True  #: whether the folder stays after the run, so that files in it have readers
+    still: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Suite -> mean tilt of a robot that stands still, deg, to compare with."""
 
     @property
     def exportable(self) -> bool:
@@ -244,9 +243,7 @@ def _journal(run: Run, done: int) -> Iterator[Callable[..., None]]:
     folder.metrics.touch()
     # Whatever other files of TensorBoard have after `done` no longer counts.
     board = Board(folder.tensorboard, purge_step=done + 1, suffix=f".from-{done}")
-    still = functools.partial(standing_still, run.config.task, run.env.scene.robot)
-    size = (STILL_SCENARIOS, run.config.validation_duration, SEEDS.validation)
-    with run.display.training(done, run.total, {suite: still(suite, *size) for suite in HEADLINE}):
+    with run.display.training(done, run.total, run.still):
 
         def write(state: TrainState, metrics: dict[str, float], seeds: dict[str, Any]) -> None:
             steps = _steps(state)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -212,6 +213,7 @@ def test_what_cannot_be_resumed_is_refused(
         ("evaluate text --json no/such/out.json", "cannot write no/such/out.json"),
         ("evaluate --controller none --json .", "cannot write .: it is a folder"),
         ("evaluate --controller none --video text", "video is text; its name must"),
+        ("evaluate --controller none --video v.mp4 --video-duration 0", "video_duration is 0"),
         ("evaluate --controller none --seed -1", "seed is -1"),
         ("evaluate --controller none --scenarios 0", "scenarios is 0"),
         ("evaluate --controller none --duration 1e12", "duration 1e+12 s: that takes about"),
@@ -295,7 +297,9 @@ def test_an_evaluation_is_of_what_was_asked_for(
 
     simulate = evaluate.run_suite
     monkeypatch.setattr(evaluate, "run_suite", run_suite)
-    monkeypatch.setattr("mjx_balance.render.drawing.write", lambda *given: None)
+    drawn: list[Any] = []
+    write = lambda *given, captions, progress: drawn.append(len(captions))  # noqa: E731
+    monkeypatch.setattr("mjx_balance.render.drawing.write", write)
     assert main(["evaluate", "--controller", "none"]) == 0
     flags = "--suite push --scenarios 3 --duration 5 --seed 7 --video v.mp4"
     assert main(["evaluate", "--controller", "none", *flags.split()]) == 0
@@ -304,6 +308,12 @@ def test_an_evaluation_is_of_what_was_asked_for(
         ("push", 3, 5.0, 7, False),
         ("push", 1, 5.0, 7, True),
     ]
+    assert drawn == [50], "a caption for each of 0.2 s of states"
+    assert main(["evaluate", "--controller", "none", "--video", "v.mp4"]) == 0
+    assert asked[-1] == ("paper", 1, 20.0, 0, True), "no more than the video shows"
+    stages = re.findall(r"^(\d/\d \S+) .*\.\.\.$", capsys.readouterr().err, re.MULTILINE)
+    with_video = ["1/2 evaluating,", "2/2 drawing"]
+    assert stages == ["1/1 evaluating,", *with_video, *with_video]
 
 
 @pytest.mark.parametrize("who", [{"policy": Path("best")}, {"controller": "pd-imu"}], ids=str)
