@@ -9,17 +9,13 @@ import numpy as np
 
 from mjx_balance import load_policy
 from mjx_balance.config import preset
+from mjx_balance.report import figures
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.task.kinematics import ramp
 
 HERE = Path(__file__).resolve().parent
-STYLE = {
-    "font.size": 9,
-    "svg.hashsalt": "mjx_balance",  # the same file from the same code
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-}
-BLUE, RED, GREY = "#1a5fa8", "#d1523f", "#9a9a9a"
+STYLE = figures.STYLE | {"font.size": 9, "axes.grid": False}
+BLUE, RED, GREY = figures.BLUE, figures.ORANGE, figures.GREY
 
 
 def decision() -> plt.Figure:
@@ -41,11 +37,11 @@ def decision() -> plt.Figure:
     samples = ms * np.arange(len(path))
     for row, lags in enumerate((task.accel_lags, task.gyro_lags)):
         seen = now - ms - ms * np.asarray(lags)
-        low.plot(samples, np.full(len(samples), row), "|", color="#c8c8c8", markersize=7)
+        low.plot(samples, np.full(len(samples), row), "|", color=GREY, alpha=0.5, markersize=7)
         low.plot(seen, np.full(len(seen), row), "|", color=RED, markersize=11, markeredgewidth=1.8)
     low.set_yticks((0, 1), ("accelerometer", "gyro"))
     low.set_ylim(-0.7, 1.7)
-    low.set_xlabel("time [ms]; red: the samples that the second decision sees (Eq. 2)")
+    low.set_xlabel("time [ms]; orange: the samples that the second decision sees (Eq. 2)")
     return figure
 
 
@@ -78,7 +74,7 @@ def main() -> None:
         for draw in (decision, radial):
             figure = draw()
             figure.tight_layout()
-            figure.savefig(HERE / f"{draw.__name__}.svg", metadata={"Date": None})
+            (HERE / f"{draw.__name__}.svg").write_bytes(figures.svg(figure))
 
 
 if __name__ == "__main__":

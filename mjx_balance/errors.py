@@ -63,6 +63,11 @@ def shell(path: Path) -> str:
     return subprocess.list2cmdline([name]) if os.name == "nt" else shlex.quote(name)
 
 
+def nearby(path: Path) -> Path:
+    """Returns a path below the working folder relative to it, any other unchanged."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
 def how_to_install(extra: str) -> str:
     """Returns the sentence that tells how to install an extra; the package is on no index."""
     return (

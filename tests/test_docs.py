@@ -361,7 +361,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         (evaluate_command, "run_suite", few),
         (evaluation, "run_suite", few),
         (evaluation, "policy_scene", scene_of),
-        (render, "write", lambda path, *_: path.write_bytes(b"")),
+        (render, "write", lambda path, *_, **how: path.write_bytes(b"")),
         (render, "Window", mock.MagicMock(return_value=shut)),
         (browser, "page_folder", lambda: REPO / "demo" / "src"),
         (browser, "write_data", lambda *_: None),

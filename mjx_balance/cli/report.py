@@ -20,8 +20,10 @@ class ReportArgs:
     """Run folders; the report compares the first with a policy to the baselines."""
     out: Path | None = None
     """File to write; none: report.html in the first folder."""
-    scenarios: int = 64
-    """Scenarios per suite and controller."""
+    scenarios: int = 8
+    """Scenarios per suite and controller; 64 give figures to quote, in some minutes."""
+    video: bool = True
+    """Draw a video, which takes longest without a GPU."""
     robot: str | None = None
     """Robot of the policy, as TOML file, menagerie:NAME or module:NAME; none: it must be a shipped
     one."""
@@ -37,7 +39,7 @@ def report(argv: list[str]) -> int:
     out = args.out or args.run_dirs[0] / "report.html"
     robot = args.robot and robot_of(args.robot)
     display = Display(Console(stderr=True))
-    missing = write_report(args.run_dirs, out, args.scenarios, display.bar, robot)
+    missing = write_report(args.run_dirs, out, args.scenarios, display.stages, robot, args.video)
     for sentence in missing:
         complain(sentence)
     print(shorten(out, PATH))

@@ -120,6 +120,8 @@ PRESETS: Mapping[str, Config] = {
         preset="quick",
         num_env_steps=8_192,
         eval_every=0,
+        eval_scenarios=16,
+        eval_duration=20.0,
         task=_TASK,
         dqn=dataclasses.replace(_DQN, replay_ratio=128.0, epsilon_decay_steps=3_000),
     ),

@@ -1,6 +1,7 @@
 """Where a controller falls: a map over the greatest incline and the speed of the board."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -46,17 +47,30 @@ def envelope(
     duration: float,
     seed: int,
     progress: Progress = lambda share: None,
+    *,
+    inclines: Sequence[float] = ENVELOPE_INCLINES,
+    rates: Sequence[float] = ENVELOPE_RATES,
 ) -> Envelope:
     """Maps falls and tilt over inclines and board speeds, with targets of suite `corner`.
+
+    Args:
+      scene: of the controller.
+      controller: to map.
+      scenarios: per cell of the map.
+      duration: of a scenario, s.
+      seed: of the scenarios.
+      progress: takes the share done.
+      inclines: greatest board angles, deg.
+      rates: board speeds, deg/s.
 
     Raises:
       EvaluationError: if there are no scenarios.
     """
     if scenarios < 1:
         raise EvaluationError(f"scenarios is {scenarios}; it must be at least 1")
-    cells = [(i, r) for i in ENVELOPE_INCLINES for r in ENVELOPE_RATES]
+    cells = [(i, r) for i in inclines for r in rates]
     # So that even the slowest board arrives; `corner` alone needs less.
-    slowest = 2 * max(ENVELOPE_INCLINES) / min(ENVELOPE_RATES)
+    slowest = 2 * max(inclines) / min(rates)
     task = scene.task
     task = dataclasses.replace(task, target_period=max(task.target_period, slowest))
     scene = dataclasses.replace(scene, task=task)
@@ -66,10 +80,10 @@ def envelope(
     incline, rate = np.repeat(np.asarray(cells), scenarios, axis=0).T
     drawn = drawn._replace(targets=incline[:, None, None] * np.sign(drawn.targets), rate=rate)
     rollout = roll_out(scene, controller, Episodes(drawn), duration, progress=progress)
-    shape = (len(ENVELOPE_INCLINES), len(ENVELOPE_RATES), scenarios)
+    shape = (len(inclines), len(rates), scenarios)
     return Envelope(
-        inclines=list(ENVELOPE_INCLINES),
-        rates=list(ENVELOPE_RATES),
+        inclines=list(inclines),
+        rates=list(rates),
         fall_rate=rollout.fell.reshape(shape).mean(axis=-1).tolist(),
         mean_tilt=rollout.tilt.mean(axis=-1).reshape(shape).mean(axis=-1).tolist(),
         authority=authority(scene.task, scene.robot),

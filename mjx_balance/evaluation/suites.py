@@ -214,6 +214,24 @@ def draw_suite(
     )
 
 
+def standing_still(
+    task: TaskConfig, robot: Robot, suite: str, scenarios: int, duration: float, seed: int
+) -> float:
+    """Mean tilt, deg, of a robot that stands still, to compare with, without a simulation.
+
+    It tilts as the board does, and from a fall on by `fail_tilt`, as in `rollout.summarize`.
+
+    Raises:
+      ConfigError, SuiteError: as `draw_suite`.
+    """
+    scenario = draw_suite(task, robot, suite, scenarios, duration, seed).scenario
+    time = task.sim_dt * np.arange(1, round(duration / task.sim_dt) + 1)
+    roll, pitch = np.moveaxis(np.radians(tilt.board_angle(task, scenario, time[None])), -1, 0)
+    tilts = np.degrees(np.arccos(np.cos(roll) * np.cos(pitch)))
+    fallen = np.maximum.accumulate(tilts > task.fail_tilt, axis=1)
+    return float(np.where(fallen, task.fail_tilt, tilts).mean())
+
+
 def _draw_pushes(
     task: TaskConfig, ranges: RandomizationConfig, scenarios: int, duration: float, seed: int
 ) -> Pushes | None:

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.robots.catalogue import in_python, use_robot
 from mjx_balance.robots.schema import RobotFile
 from mjx_balance.sim.scene import Scene, build_model
+from mjx_balance.task.attitude import body_tilt
 
 FPS = 25
 VIDEO_SIZE = (960, 544)
@@ -41,19 +42,32 @@ class RenderError(RuntimeError):
     """This machine cannot draw pictures or open a window; the message says why."""
 
 
-def write(path: Path, scene: Scene, qpos: np.ndarray) -> None:
+def write(
+    path: Path,
+    scene: Scene,
+    qpos: np.ndarray,
+    *,
+    captions: Sequence[str] = (),
+    size: tuple[int, int] | None = None,
+    fps: float = FPS,
+    progress: Callable[[float], object] = lambda share: None,
+) -> None:
     """Draws the first state to a `.png` file, or all states to a video, atomically.
 
     Args:
       path: file to write; any suffix but `.png` makes a video, at real speed.
       scene: robot, board and time step.
       qpos: (steps, nq), one state per physics step.
+      captions: a tabbed line per state, of `captions`, drawn into the video; none: without.
+      size: (width, height); none: `PICTURE_SIZE` or `VIDEO_SIZE`.
+      fps: about how many pictures a second a video has.
+      progress: called with the share of the video that is drawn.
 
     Raises:
       RenderError: if no OpenGL backend works here, or the file cannot be written.
     """
-    is_picture, stride = path.suffix == ".png", frame_stride(scene.task)
-    painter = Painter(scene, PICTURE_SIZE if is_picture else VIDEO_SIZE)
+    is_picture, stride = path.suffix == ".png", frame_stride(scene.task, fps)
+    painter = Painter(scene, size or (PICTURE_SIZE if is_picture else VIDEO_SIZE))
     try:
         import imageio.v2 as imageio
 
@@ -62,16 +76,45 @@ def write(path: Path, scene: Scene, qpos: np.ndarray) -> None:
             if is_picture:
                 imageio.imwrite(file, painter.draw(qpos[0]))
             else:
-                fps = 1 / (stride * scene.task.sim_dt)
-                with imageio.get_writer(file, fps=fps, quality=8) as writer:
-                    for state in qpos[::stride]:
-                        writer.append_data(painter.draw(state))
+                rate = 1 / (stride * scene.task.sim_dt)
+                with imageio.get_writer(file, fps=rate, quality=8) as writer:
+                    for step in range(0, len(qpos), stride):
+                        picture = painter.draw(qpos[step])
+                        writer.append_data(_inscribed(picture, *captions[step : step + 1]))
+                        progress(min((step + stride) / len(qpos), 1.0))
             write_atomically(path, file.read_bytes())
     except RenderError:
         raise
     except (OSError, RuntimeError, ValueError, ImportError) as error:  # imageio's own, too
         reason = getattr(error, "strerror", None) or shorten(error, MESSAGE)
         raise RenderError(f"{path} cannot be written: {reason}") from error
+
+
+def captions(scene: Scene, qpos: np.ndarray) -> list[str]:
+    """Time, the board's angles and the body's tilt, for each state (steps, nq) a tabbed line."""
+    board = np.degrees(qpos[:, scene.board_qpos])
+    tilt = body_tilt(qpos[:, scene.trunk_quat])
+    time = scene.task.sim_dt * np.arange(1, len(qpos) + 1)
+    return [
+        f"{t:.1f} s\tboard {x:+.1f}°, {y:+.1f}°\tbody tilt {b:.2f}°"
+        for t, (x, y), b in zip(time, board, tilt, strict=True)
+    ]
+
+
+def _inscribed(picture: np.ndarray, caption: str = "") -> np.ndarray:
+    """The picture (height, width, 3), uint8, with a tabbed line on a dark strip at its top."""
+    if not caption:
+        return picture
+    from PIL import Image, ImageDraw, ImageFont  # imageio's
+
+    height = picture.shape[0] // 20
+    picture = picture.copy()
+    picture[: 2 * height] //= 3
+    image, font = Image.fromarray(picture), ImageFont.load_default(height)
+    for place, words in zip((0.04, 0.28, 0.7), caption.split("\t"), strict=True):
+        at = (place * picture.shape[1], height)
+        ImageDraw.Draw(image).text(at, words, "white", font, anchor="lm")
+    return np.asarray(image)
 
 
 class Painter:
@@ -198,9 +241,9 @@ class Window:
         self._viewer.close()
 
 
-def frame_stride(task: TaskConfig) -> int:
-    """Physics steps per picture, for about `FPS` pictures a second."""
-    return max(1, round(1 / (FPS * task.sim_dt)))
+def frame_stride(task: TaskConfig, fps: float = FPS) -> int:
+    """Physics steps per picture, for about `fps` pictures a second."""
+    return max(1, round(1 / (fps * task.sim_dt)))
 
 
 def _check_display() -> None:
@@ -244,6 +287,7 @@ def _serve() -> None:
     if header["file"]:
         use_robot(from_dict(RobotFile, header["file"]), header["robot"])
     model = build_model(from_dict(TaskConfig, header["task"]), header["robot"], visual=True)
+    model.vis.quality.offsamples = 4  # with the scene's 8 a CPU draws half as long again
     data = mujoco.MjData(model)
     width, height = header["size"]
     with mujoco.Renderer(model, height, width) as renderer:

@@ -21,10 +21,31 @@ with matplotlib_imports():
     import matplotlib as mpl
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure  # pyplot would choose a backend; these figures need none
+    from matplotlib.legend_handler import HandlerTuple
     from matplotlib.ticker import LogLocator
 
-BLUE, ORANGE, GREY, GREEN = "#2166ac", "#d6604d", "#777777", "#4d9221"
-SHADES = ("#b2182b", "#ef8a62", "#7f7f7f", "#1a9850", "#91cf60")
+# Okabe and Ito's colours, which the colour-blind tell apart: https://jfly.uni-koeln.de/color/
+BLUE, ORANGE, GREEN, PURPLE, AMBER = "#0072b2", "#d55e00", "#009e73", "#b05a8c", "#b8860b"
+INK, GREY = "#1d2531", "#75808f"  #: of text and axes; of what is not the robot's
+DARK = {
+    BLUE: "#5ab4ea",
+    ORANGE: "#ff8a3d",
+    GREEN: "#2dc79b",
+    PURPLE: "#e39bc6",
+    AMBER: "#f0c040",
+    INK: "#dfe5ec",
+    GREY: "#9aa5b4",
+}
+"""Colour -> the one to take its place on a dark page."""
+LINES = (
+    (BLUE, "-"),
+    (GREY, "-"),
+    (ORANGE, "--"),
+    (GREEN, "-."),
+    (AMBER, ":"),
+    (PURPLE, (0, (5, 1, 1, 1, 1, 1))),
+)
+"""Colour and dashes of each controller, in the order of `measuring.NAMES`."""
 STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
     "savefig.dpi": 150,
@@ -32,10 +53,17 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "grid.color": GREY,
     "grid.alpha": 0.25,
     "legend.frameon": False,
     "axes.titlelocation": "left",
+    "path.simplify_threshold": 0.4,  # px; a curve of 25,000 points becomes a third smaller
+    "svg.hashsalt": "mjx_balance",  # the same file from the same figure
+    **dict.fromkeys(
+        ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK
+    ),
 }
+NO_DATE = {"Date": None}
 styled = mpl.rc_context(STYLE)  #: decorates a function that draws in this style
 
 
@@ -74,6 +102,53 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+@styled
+def svg(figure: Figure) -> bytes:
+    """Returns the bytes of an SVG file that shows the figure on light and on dark pages."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", bbox_inches="tight", transparent=True, metadata=NO_DATE)
+    names = {colour: f"c{number}" for number, colour in enumerate(DARK)}
+    light = "".join(f"--{name}:{colour};" for colour, name in names.items())
+    dark = "".join(f"--{names[colour]}:{other};" for colour, other in DARK.items())
+    style = f"svg{{{light}}}@media(prefers-color-scheme:dark){{svg{{{dark}}}}}"
+    text = buffer.getvalue()
+    for colour, name in names.items():
+        text = text.replace(colour, f"var(--{name})")
+    start = text.index(">", text.index("<svg ")) + 1
+    return f"{text[:start]}<style>{style}</style>{text[start:]}".encode()
+
+
+def label_right(
+    axis: Axes, labels: list[tuple[str, str, float, float]], spacing: float = 0.085
+) -> None:
+    """Writes labels beside the plot, each joined to a point of its curve, none over another.
+
+    Args:
+      axis: with its final scales and limits.
+      labels: text, colour, x and y of the point.
+      spacing: least distance between two labels, as a share of the axis' height.
+    """
+    to_share = axis.transData + axis.transAxes.inverted()
+    places = [float(to_share.transform((x, y))[1]) for _, _, x, y in labels]
+    order = sorted(range(len(labels)), key=lambda k: places[k])
+    heights = np.clip([places[k] for k in order], 0, 1)
+    for k in range(1, len(heights)):
+        heights[k] = max(heights[k], heights[k - 1] + spacing)
+    for k in range(len(heights) - 1, -1, -1):  # what stands too high now moves down
+        heights[k] = min(heights[k], 1 - spacing * (len(heights) - 1 - k))
+    for k, height in zip(order, heights, strict=True):
+        text, colour, x, y = labels[k]
+        axis.annotate(
+            text,
+            (x, y),
+            (1.03, height),
+            textcoords="axes fraction",
+            color=colour,
+            va="center",
+            arrowprops={"arrowstyle": "-", "color": colour, "lw": 0.7, "alpha": 0.6},
+        )
+
+
 CURVES = (
     ("train/tilt_deg", "mean body tilt [deg]", "log"),
     ("train/falls_per_minute", "falls per robot-minute", "symlog"),
@@ -83,6 +158,7 @@ CURVES = (
     ("perf/env_steps_per_second", "decisions per second", "linear"),
 )
 """Metric, title and scale of each panel of the learning curves."""
+LABELLED = (0.2, 3e-4)  #: shares of the time between which curves of the tilt are labelled
 HELD_OUT = {f"eval/{suite}/tilt_mean": f"held out, {suite}" for suite in HEADLINE}
 """Validation metrics that the tilt panel shows as points, and their labels."""
 
@@ -116,7 +192,7 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> Figure:
         if len(values) > 1:
             low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
             axis.fill_between(thousands, low, high, color=BLUE, alpha=0.2, lw=0)
-        axis.plot(thousands, np.nanmedian(values, axis=0), color=BLUE, lw=1.6)
+        axis.plot(thousands, np.nanmedian(values, axis=0), color=BLUE, lw=1.6, label="exploring")
         axis.set_title(title)
         axis.set_yscale(scale, **({"linthresh": 0.1} if scale == "symlog" else {}))
         if name == "train/tilt_deg":
@@ -132,7 +208,9 @@ def learning_curves(runs: list[list[dict[str, Any]]]) -> Figure:
 
 
 def _draw_held_out(axis: Axes, runs: list[list[dict[str, Any]]]) -> None:
-    for (name, label), colour in zip(HELD_OUT.items(), (ORANGE, GREY), strict=True):
+    for (name, label), colour, marker in zip(
+        HELD_OUT.items(), (ORANGE, GREEN), ("o", "s"), strict=True
+    ):
         points = [
             (line["env_steps"] / 1000, value)
             for run in runs
@@ -141,7 +219,7 @@ def _draw_held_out(axis: Axes, runs: list[list[dict[str, Any]]]) -> None:
             if value is not None and value > 0
         ]
         if points:
-            axis.plot(*zip(*points, strict=True), "o", ms=4, color=colour, label=label)
+            axis.plot(*zip(*points, strict=True), marker, ms=4, color=colour, label=label)
             axis.legend()
 
 
@@ -165,8 +243,10 @@ def reward_figure(task: TaskConfig) -> Figure:
     left.set(title="instant incline (paper Eq. 4, Fig. 4)", xlabel="body tilt [deg]")
     left.set_ylabel("reward")
     toward = reward_terms(task, RewardInputs(change, none, none))["toward"]
-    right.plot(change, np.where(toward >= 0, toward, np.nan), color=GREEN, lw=2)
-    right.plot(change, np.where(toward <= 0, toward, np.nan), color=ORANGE, lw=2)
+    gain, loss = np.where(toward >= 0, toward, np.nan), np.where(toward <= 0, toward, np.nan)
+    right.plot(change, gain, color=GREEN, lw=2, label="the tilt has decreased")
+    right.plot(change, loss, color=ORANGE, lw=2, ls="--", label="the tilt has increased")
+    right.legend(loc="upper left")
     right.set_title("toward horizontal (our reading of Fig. 5)")
     right.set_xlabel("tilt before less tilt after [deg]")
     return figure
@@ -174,42 +254,66 @@ def reward_figure(task: TaskConfig) -> Figure:
 
 @styled
 def rollout_figure(scene: Scene, rollouts: Mapping[str, Rollout]) -> Figure:
-    """The paper's Fig. 7: board and body angles over time in plain MuJoCo.
+    """The paper's Fig. 7: angles of board and body over time, in plain MuJoCo.
+
+    The body's angles have a scale of their own; the lowest panel shows on a log scale how much
+    the body tilts, and how much the board, as a robot would that stands still.
 
     Args:
       scene: of the rollouts.
-      rollouts: name -> rollout of one scenario with `qpos`; one column each.
+      rollouts: name -> rollout of one scenario with `qpos`, the same for all.
     """
-    count = len(rollouts)
-    figure = Figure(figsize=(max(11, 6.5 * count), 7), layout="constrained")
-    axes = figure.subplots(4, count, sharex=True, sharey=True, squeeze=False)
-    for column, (name, rollout) in zip(axes.T, rollouts.items(), strict=True):
-        _draw_rollout(column, scene, rollout)
-        column[0].set_title(
-            f"{name}: mean tilt {rollout.tilt.mean():.2f} deg, "
-            f"greatest {rollout.tilt.max():.2f} deg"
-            + (", the robot fell" if rollout.fell[0] else "")
-        )
-        column[-1].set_xlabel("time [s]; dotted: the board takes a new target")
-    names = ("board X", "board Y", "body roll", "body pitch")
-    for axis, name in zip(axes[:, 0], names, strict=True):
+    figure = Figure(figsize=(11, 7.6), layout="constrained")
+    axes = figure.subplots(4, 1, sharex=True)
+    task = next(iter(rollouts.values())).task
+    reach, end = 0.0, 0.0
+    for (name, rollout), (colour, dashes) in zip(
+        rollouts.items(), (LINES[0], LINES[2], LINES[3]), strict=False
+    ):
+        assert rollout.qpos is not None, "the rollout is not recorded"
+        qpos = rollout.qpos[0]
+        time = np.arange(1, len(qpos) + 1) * task.sim_dt
+        end = time[-1]
+        roll, pitch = roll_pitch(qpos[:, scene.trunk_quat])
+        if colour == BLUE:
+            board = np.degrees(qpos[:, scene.board_qpos])
+            _draw_board(axes, time, board)
+        for axis, values in zip(axes[1:], (roll, pitch, rollout.tilt[0]), strict=True):
+            axis.plot(
+                *(time, values),
+                color=colour,
+                ls=dashes,
+                lw=1.6 if colour == BLUE else 1.1,
+                zorder=3 if colour == BLUE else 2,
+                label=f"{name}: mean {rollout.tilt.mean():.3f}, max {rollout.tilt.max():.2f} deg"
+                + (", falls" if rollout.fell[0] else ""),
+            )
+        if not rollout.fell[0] or colour == BLUE:  # a fall of others would make all else flat
+            reach = max(reach, np.abs(roll).max(), np.abs(pitch).max())
+    for axis, name in zip(axes, ("board", "body roll", "body pitch", "tilt"), strict=True):
         axis.set_ylabel(f"{name} [deg]")
+        for change in np.arange(0, end, task.target_period):
+            axis.axvline(change, color=INK, lw=0.8, ls=":", alpha=0.6)
+    for axis in axes[1:3]:
+        axis.set_ylim(-1.1 * reach, 1.1 * reach)
+    axes[3].set(yscale="log", ylim=(0.003, 1.6 * max(task.fail_tilt, task.max_incline)))
+    axes[3].yaxis.set_major_formatter("{x:g}")
+    figure.legend(*axes[3].get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    axes[3].set_xlabel("time [s]; dotted: the board takes a new target")
     return figure
 
 
-def _draw_rollout(column: np.ndarray, scene: Scene, rollout: Rollout) -> None:
-    assert rollout.qpos is not None, "the rollout is not recorded"
-    task, qpos = rollout.task, rollout.qpos[0]
-    time = np.arange(1, len(qpos) + 1) * task.sim_dt
-    board = np.degrees(qpos[:, scene.board_qpos])
-    roll, pitch = roll_pitch(qpos[:, scene.trunk_quat])
-    curves = ((board[:, 0], GREY), (board[:, 1], GREY), (roll, BLUE), (pitch, ORANGE))
-    for axis, (values, colour) in zip(column, curves, strict=True):
-        axis.plot(time, values, color=colour, lw=1.2)
-        axis.set_ylim(-1.05 * task.max_incline, 1.05 * task.max_incline)
-        axis.axhline(0, color="black", lw=0.5)
-        for change in np.arange(0, time[-1], task.target_period):
-            axis.axvline(change, color="black", lw=0.8, ls=":")
+def _draw_board(axes: np.ndarray, time: np.ndarray, board: np.ndarray) -> None:
+    """The board's angles (steps, 2), deg, in the first panel, and its tilt in the last."""
+    x, y = board.T
+    axes[0].plot(time, x, color=INK, lw=1.3)
+    axes[0].plot(time, y, color=PURPLE, lw=1.3, ls="--")
+    axes[0].set_xlim(0, time[-1])
+    label_right(axes[0], [("X", INK, time[-1], x[-1]), ("Y", PURPLE, time[-1], y[-1])], 0.2)
+    both = np.radians(board)
+    tilt = np.degrees(np.arccos(np.cos(both[:, 0]) * np.cos(both[:, 1])))
+    label = f"standing still (the board's tilt): mean {tilt.mean():.2f}, max {tilt.max():.2f} deg"
+    axes[3].plot(time, tilt, color=GREY, lw=1.3, label=label)
 
 
 @styled
@@ -220,17 +324,25 @@ def tilt_figure(shares: Mapping[str, np.ndarray], edges: np.ndarray) -> Figure:
       shares: name -> (len(edges) - 1,) share of the physics steps per bin of tilt.
       edges: (bins + 1,) bounds of the bins, deg.
     """
-    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
     axis = figure.subplots()
-    for (name, share), colour in zip(shares.items(), (BLUE, *SHADES), strict=False):
-        beyond = 1 - np.cumsum(share)
-        width = 2.6 if colour == BLUE else 1.4
-        values = np.where(beyond > 1e-7, beyond, np.nan)
-        axis.loglog(edges[1:], values, label=name, color=colour, lw=width)
-    axis.set(xlim=(0.02, edges[-1]), xlabel="body tilt [deg]")
+    axis.set(xscale="log", yscale="log", xlim=(0.02, edges[-1]), ylim=(1e-5, 1.3))
+    beyond = {name: 1 - np.cumsum(share) for name, share in shares.items()}
+    for (name, share), (colour, dashes) in zip(beyond.items(), LINES, strict=False):
+        width = 2.6 if colour == BLUE else 1.6
+        values = np.where(share > 1e-7, share, np.nan)
+        axis.plot(edges[1:], values, label=name, color=colour, lw=width, ls=dashes)
+    # Each at a height of its own, the farthest on top.
+    order = sorted(beyond, key=lambda name: -np.count_nonzero(beyond[name] > LABELLED[0]))
+    levels, labels = np.geomspace(*LABELLED, len(order)), []
+    for name, level in zip(order, levels, strict=True):
+        near = int(np.argmin(np.abs(np.log(np.maximum(beyond[name], 1e-9) / level))))
+        line = axis.get_lines()[list(beyond).index(name)]
+        labels.append((name, str(line.get_color()), edges[1:][near], beyond[name][near]))
+    label_right(axis, labels)
+    axis.set_xlabel("body tilt [deg]")
     axis.set_title("share of the time that the body is tilted further")
     axis.xaxis.set_major_formatter("{x:g}")
-    axis.legend(loc="lower left")
     return figure
 
 
@@ -249,12 +361,24 @@ def envelope_figure(envelope: Envelope, limit: float) -> Figure:
         (envelope.mean_tilt, "mean body tilt [deg]", "viridis_r", limit),
     )
     rates, inclines = envelope.rates, envelope.inclines
+    handles: list[Any] = []
     for axis, (values, title, colours, top) in zip(axes, maps, strict=True):
         image = axis.pcolormesh(rates, inclines, values, cmap=colours, vmin=0, vmax=top)
         figure.colorbar(image, ax=axis)
-        speeds = [rates[0], envelope.authority, envelope.authority]
-        axis.plot(speeds, [envelope.reach, envelope.reach, inclines[0]], "k--", lw=1.8)
+        limits = (
+            [rates[0], envelope.authority, envelope.authority],
+            [envelope.reach, envelope.reach, inclines[0]],
+        )
+        # On any colour, and on any page.
+        handles = axis.plot(*limits, color="black", ls="--", lw=1.8, zorder=3)
+        handles = axis.plot(*limits, color="white", lw=3.4, zorder=2) + handles
         axis.set(title=title, xlabel="board speed on each axis [deg/s]")
         axis.grid(visible=False)
     axes[0].set_ylabel("board angle on both axes at once [deg]")
+    figure.legend(
+        [tuple(handles)],  # pyright: ignore[reportArgumentType]
+        ["to the right or above: out of reach for these actions and legs"],
+        handler_map={tuple: HandlerTuple(ndivide=1)},
+        loc="outside lower left",
+    )
     return figure

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,22 +14,35 @@ from annotated_types import Len
 from mjx_balance.config import to_dict
 from mjx_balance.evaluation.controllers import CONTROLLERS, Controller, make_controller
 from mjx_balance.evaluation.envelope import Envelope, envelope
-from mjx_balance.evaluation.rollout import GreedyPolicy, Rollout, observing, run_suite, summarize
+from mjx_balance.evaluation.rollout import (
+    GreedyPolicy,
+    Progress,
+    Rollout,
+    observing,
+    run_suite,
+    summarize,
+)
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import read_json, write_atomically
 from mjx_balance.files.sources import code
 from mjx_balance.files.validation import parse
 from mjx_balance.policy.file import Policy
+from mjx_balance.report.progress import Stage, part
 from mjx_balance.report.reading import FOREIGN, Finite, ReportError, suite_results
 from mjx_balance.sim.scene import Scene
 
 DURATION = 60.0
 ENVELOPE_SCENARIOS = 2
 ENVELOPE_DURATION = 30.0
+ENVELOPE_GRID = {
+    "inclines": (2.0, 4.0, 6.0, 8.0, 10.0, 12.0),
+    "rates": (2.5, 3.0, 3.5, 4.0, 4.5, 5.0),
+}
 RECORD_SECONDS = 100.0  #: as long as the paper's Fig. 7
-VIDEO_SECONDS = 12.0
+VIDEO_SECONDS = 8.0
 BINS = 161  #: of the tilt distribution
 NAMES = ("policy", *CONTROLLERS)  #: of all that is measured
+STAGES = len(HEADLINE) + 1  #: of a measurement
 _Shares = dict[str, dict[str, Annotated[list[Finite], Len(BINS, BINS)]]]
 
 
@@ -55,28 +67,36 @@ def edges(fail_tilt: float) -> np.ndarray:
     return np.concatenate(([0.0], np.geomspace(0.01, fail_tilt, BINS - 1), [fail_tilt + 1e-4]))
 
 
-def load_or_measure(
-    policy: Policy, scene: Scene, file: Path, scenarios: int, progress: Callable[[str], Any]
-) -> Measurements:
-    """Measures policy and baselines, or reads an earlier result of the same measurement.
+def load(policy: Policy, scene: Scene, file: Path, scenarios: int) -> Measurements | None:
+    """Reads an earlier result of the same measurement; None if the file holds none.
 
     Args:
       policy: has the name `policy` in the results.
       scene: the policy's.
-      file: JSON file that stores the result; missing, damaged or outdated ones are replaced.
+      file: JSON file of `measure`; one that is damaged or outdated counts as none.
       scenarios: per suite and controller.
-      progress: title -> context manager that gives a callable taking the share done.
     """
-    key = [policy.fingerprint, to_dict(policy.config), scene.hash, code_digest()]
-    key += [scenarios, DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
     with contextlib.suppress(*FOREIGN):  # an unusable file is replaced
         saved = read_json(file)
-        if saved["key"] == key:
+        if saved["key"] == _key(policy, scene, scenarios):
             return parse_measurements(saved)
-    result = _measure(policy, scene, scenarios, progress)
+    return None
+
+
+def measure(policy: Policy, scene: Scene, file: Path, scenarios: int, stage: Stage) -> Measurements:
+    """Measures policy and baselines, in `STAGES` stages, and stores the result for `load`."""
+    result = _measure(policy, scene, scenarios, stage)
+    saved = {"key": _key(policy, scene, scenarios), **dataclasses.asdict(result)}
     with contextlib.suppress(OSError):  # a read-only folder stores nothing
-        write_atomically(file, json.dumps({"key": key, **dataclasses.asdict(result)}) + "\n")
+        write_atomically(file, json.dumps(saved) + "\n")
     return result
+
+
+def _key(policy: Policy, scene: Scene, scenarios: int) -> list[Any]:
+    """All that decides a result, as JSON values."""
+    key = [policy.fingerprint, to_dict(policy.config), scene.hash, code_digest(), scenarios]
+    key += [DURATION, SEEDS.report, ENVELOPE_SCENARIOS, ENVELOPE_DURATION]
+    return [*key, *map(list, ENVELOPE_GRID.values())]
 
 
 def parse_measurements(saved: dict[str, Any]) -> Measurements:
@@ -100,25 +120,23 @@ def parse_measurements(saved: dict[str, Any]) -> Measurements:
     )
 
 
-def _measure(
-    policy: Policy, scene: Scene, scenarios: int, progress: Callable[[str], Any]
-) -> Measurements:
-    results: dict[str, dict[str, Any]] = {}
-    shares: dict[str, dict[str, list[float]]] = {}
+def _measure(policy: Policy, scene: Scene, scenarios: int, stage: Stage) -> Measurements:
+    summaries: dict[str, dict[str, Any]] = {name: {} for name in NAMES}
+    shares: dict[str, dict[str, list[float]]] = {name: {} for name in NAMES}
     size, seed = (scenarios, DURATION), SEEDS.report
-    for name in NAMES:
-        summaries, shares[name] = {}, {}
-        for suite in HEADLINE:
-            controller = _controller(name, policy, scene)
-            with progress(f"{name}, suite {suite}") as bar:
-                rollout = run_suite(scene, controller, suite, *size, seed, bar)
-            summaries[suite] = summarize(rollout, suite, DURATION, seed)
-            counts, _ = np.histogram(rollout.tilt, edges(policy.config.task.fail_tilt))
-            shares[name][suite] = (counts / counts.sum()).tolist()
-        results[name] = suite_results(summaries)
+    for suite in HEADLINE:
+        with stage(f"policy and baselines, suite {suite}") as bar:
+            for k, name in enumerate(NAMES):
+                controller = _controller(name, policy, scene)
+                rollout = run_suite(scene, controller, suite, *size, seed, part(bar, k, len(NAMES)))
+                summaries[name][suite] = summarize(rollout, suite, DURATION, seed)
+                counts, _ = np.histogram(rollout.tilt, edges(policy.config.task.fail_tilt))
+                shares[name][suite] = (counts / counts.sum()).tolist()
+    results = {name: suite_results(summary) for name, summary in summaries.items()}
     size = (ENVELOPE_SCENARIOS, ENVELOPE_DURATION)
-    with progress("envelope") as bar:
-        return Measurements(results, shares, envelope(scene, observing(policy), *size, seed, bar))
+    with stage("envelope") as bar:
+        cells = envelope(scene, observing(policy), *size, seed, bar, **ENVELOPE_GRID)
+    return Measurements(results, shares, cells)
 
 
 def record_rollout(
@@ -128,13 +146,14 @@ def record_rollout(
     duration: float,
     seed: int,
     controller: str = "policy",
+    progress: Progress = lambda share: None,
 ) -> Rollout:
     """Runs one scenario of `duration` s and records every state, for a figure or a video.
 
     The controller is `policy`, or the name of a baseline to run in its place.
     """
     acting = _controller(controller, policy, scene)
-    return run_suite(scene, acting, suite, 1, duration, seed, record=True)
+    return run_suite(scene, acting, suite, 1, duration, seed, progress, record=True)
 
 
 def _controller(name: str, policy: GreedyPolicy, scene: Scene) -> Controller:

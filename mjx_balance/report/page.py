@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import itertools
 import json
 import shlex
 import tempfile
@@ -13,19 +14,21 @@ import jinja2
 import numpy as np
 
 from mjx_balance.config import Config, ConfigError, flatten, preset, to_dict
-from mjx_balance.evaluation.rollout import SETTLED_SECONDS, policy_scene
+from mjx_balance.evaluation.rollout import SETTLED_SECONDS, Progress, policy_scene
 from mjx_balance.evaluation.statistics import TILTS, over_seeds
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import RunFolder, write_atomically
 from mjx_balance.policy.file import Policy, PolicyError
 from mjx_balance.render import drawing as render
-from mjx_balance.report import figures, measuring
+from mjx_balance.report import alt_texts, figures, measuring
 from mjx_balance.report.measuring import Measurements
+from mjx_balance.report.progress import Stage, part
 from mjx_balance.report.reading import Run, read_run
 from mjx_balance.report.tables import spread
 from mjx_balance.sim.scene import Scene
 
 TEMPLATE = "page.html"
+VIDEO_SIZE, VIDEO_FPS = (640, 368), 10.0  #: small: software draws three pictures a second
 CONSTANTS = {
     "measuring": measuring,
     "report_seed": SEEDS.report,
@@ -35,12 +38,21 @@ CONSTANTS = {
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A figure in a page."""
+
+    alt: str  #: what is seen
+    svg: str  #: base64
+
+
 def write_report(
     run_dirs: Sequence[Path],
     out: Path,
     scenarios: int,
-    progress: Callable[[str], Any],
+    stages: Callable[[int], Stage],
     robot: str | None = None,
+    with_video: bool = True,
 ) -> list[str]:
     """Writes one self-contained HTML file; returns what is missing, one sentence each.
 
@@ -51,8 +63,9 @@ def write_report(
       run_dirs: run folders, complete or not.
       out: file to write.
       scenarios: per suite and controller.
-      progress: title -> context manager that gives a callable taking the share done.
+      stages: number of stages -> what shows them.
       robot: of the policy; none: it must be a shipped one.
+      with_video: whether to draw one.
 
     Raises:
       ReportError: for a folder that is no run folder.
@@ -75,8 +88,21 @@ def write_report(
         page["versions"] = versions(first.policy)
         try:
             scene = policy_scene(first.policy, robot)
-            page |= _policy_sections(first, first.policy, scene, runs, scenarios, progress)
-            page["video"] = video(first.policy, scene)
+            file = RunFolder(first.path).report
+            measured = measuring.load(first.policy, scene, file, scenarios)
+            stage = stages((0 if measured else measuring.STAGES) + 1 + with_video)
+            if measured is None:
+                measured = measuring.measure(first.policy, scene, file, scenarios, stage)
+            page |= {
+                "policy": first.policy,
+                "measurements": measured,
+                "seeds": seeds_statistics(first, runs),
+            }
+            with stage("recording and drawing figures") as bar:
+                page["pictures"] = policy_pictures(first.policy, scene, measured, bar)
+            if with_video:
+                with stage("drawing the video") as bar:
+                    page["video"] = video(first.policy, scene, bar)
         except (PolicyError, ConfigError) as error:
             missing.append(f"{first.path}: {error}")
         except render.RenderError as error:
@@ -99,25 +125,6 @@ def render_page(page: dict[str, Any]) -> str:
     return environment.get_template(TEMPLATE).render(CONSTANTS | page)
 
 
-def _policy_sections(
-    run: Run,
-    policy: Policy,
-    scene: Scene,
-    runs: Sequence[Run],
-    scenarios: int,
-    progress: Callable[[str], Any],
-) -> dict[str, Any]:
-    """The page's values about a run's policy, but for the video."""
-    file = RunFolder(run.path).report
-    measurements = measuring.load_or_measure(policy, scene, file, scenarios, progress)
-    return {
-        "policy": policy,
-        "measurements": measurements,
-        "seeds": seeds_statistics(run, runs),
-        "pictures": policy_pictures(policy, scene, measurements),
-    }
-
-
 def seeds_statistics(run: Run, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
     """Suite -> statistics over the seeds of runs like `run`; empty for fewer than two seeds."""
 
@@ -133,21 +140,32 @@ def seeds_statistics(run: Run, runs: Sequence[Run]) -> dict[str, dict[str, Any]]
     return {suite: over_seeds([result[suite] for result in each]) for suite in shared}
 
 
-def policy_pictures(policy: Policy, scene: Scene, measurements: Measurements) -> dict[str, str]:
-    """The paper's Fig. 7 by suite, the tilt's distribution and the envelope: PNGs in base64."""
+def policy_pictures(
+    policy: Policy, scene: Scene, measurements: Measurements, bar: Progress
+) -> dict[str, Picture]:
+    """The paper's Fig. 7 by suite, the tilt's distribution and the envelope."""
     fail_tilt, pictures = policy.config.task.fail_tilt, {}
     record, seconds = measuring.record_rollout, measuring.RECORD_SECONDS
+    names = ("policy", "pd-imu")
+    parts = (part(bar, k, 2 * len(HEADLINE) + 1) for k in itertools.count())
     for suite in HEADLINE:
-        names = ("policy", "pd-imu")
-        rollouts = {x: record(policy, scene, suite, seconds, SEEDS.record, x) for x in names}
-        pictures[suite] = _picture(figures.rollout_figure(scene, rollouts))
+        rollouts = {
+            name: record(policy, scene, suite, seconds, SEEDS.record, name, next(parts))
+            for name in names
+        }
+        figure = figures.rollout_figure(scene, rollouts)
+        pictures[suite] = _picture(figure, alt_texts.rollout_alt(suite, rollouts))
     shares = {name: np.asarray(suites["paper"]) for name, suites in measurements.shares.items()}
-    tilt = figures.tilt_figure(shares, measuring.edges(fail_tilt))
+    edges = measuring.edges(fail_tilt)
+    tilt = figures.tilt_figure(shares, edges)
     envelope = figures.envelope_figure(measurements.envelope, fail_tilt)
-    return pictures | {"tilt": _picture(tilt), "envelope": _picture(envelope)}
+    return pictures | {
+        "tilt": _picture(tilt, alt_texts.tilt_alt(shares, edges)),
+        "envelope": _picture(envelope, alt_texts.envelope_alt(measurements.envelope)),
+    }
 
 
-def video(policy: Policy, scene: Scene) -> str:
+def video(policy: Policy, scene: Scene, bar: Progress) -> str:
     """MP4 of a scenario of suite corner, in base64.
 
     Raises:
@@ -156,25 +174,29 @@ def video(policy: Policy, scene: Scene) -> str:
     seconds, seed = measuring.VIDEO_SECONDS, SEEDS.report
     rollout = measuring.record_rollout(policy, scene, "corner", seconds, seed)
     assert rollout.qpos is not None
+    states = rollout.qpos[0]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "video.mp4"
-        render.write(file, scene, rollout.qpos[0])
+        words = render.captions(scene, states)
+        small = {"size": VIDEO_SIZE, "fps": VIDEO_FPS}
+        render.write(file, scene, states, captions=words, progress=bar, **small)
         return base64.b64encode(file.read_bytes()).decode()
 
 
-def training_pictures(runs: Sequence[Run], config: Config | None) -> dict[str, str]:
-    """`curves` and `reward`, as far as there are metrics and a config -> PNG in base64."""
+def training_pictures(runs: Sequence[Run], config: Config | None) -> dict[str, Picture]:
+    """`curves` and `reward`, as far as there are metrics and a config."""
     pictures = {}
     curves = [run.metrics for run in runs if run.metrics]
     if curves:
-        pictures["curves"] = _picture(figures.learning_curves(curves))
+        pictures["curves"] = _picture(figures.learning_curves(curves), alt_texts.curves_alt(curves))
     if config is not None:
-        pictures["reward"] = _picture(figures.reward_figure(config.task))
+        reward = figures.reward_figure(config.task)
+        pictures["reward"] = _picture(reward, alt_texts.reward_alt(config.task))
     return pictures
 
 
-def _picture(figure: figures.Figure) -> str:
-    return base64.b64encode(figures.png(figure)).decode()
+def _picture(figure: figures.Figure, alt: str) -> Picture:
+    return Picture(alt, base64.b64encode(figures.svg(figure)).decode())
 
 
 def config_tables(config: Config) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mjx_balance.errors import PATH, shell, shorten
+from mjx_balance.errors import PATH, nearby, shell, shorten
 from mjx_balance.evaluation.statistics import TILTS
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.robots.catalogue import shipped
@@ -95,18 +95,20 @@ def print_summary(
     folder = RunFolder(run_dir)
     flag = "" if robot in shipped() else f" --robot {shell(Path(robot))}"
     print_table(console, evaluation_table(results))
+    shown = shorten(nearby(run_dir), PATH)
+    # One name a line, so that nothing wraps at 80 columns.
+    console.print(f"{escape(shown)}/", highlight=False, soft_wrap=True)
     for path, what in (
         (folder.policy, f"the policy; `mjx-balance evaluate{escape(flag)}` runs it"),
         (folder.evaluation, "the table above"),
-        (f"{folder.figures}/", "learning curves, rewards, 100 s on the board"),
+        (folder.figures, "learning curves, rewards, 100 s on the board"),
         (folder.metrics, f"every logged number; {folder.tensorboard.name}/ has them too"),
-        (f"{folder.checkpoints}/", "the whole training state"),
+        (folder.checkpoints, "the whole training state"),
     ):
-        console.print(
-            f"{escape(shorten(path, PATH))}  [dim]{what}[/dim]", highlight=False, soft_wrap=True
-        )
+        name = f"{path.name}/" if path.suffix == "" else path.name
+        console.print(f"  {name}  [dim]{what}[/dim]", highlight=False, soft_wrap=True)
     console.print(
-        f"`mjx-balance report {shell(run_dir)}{flag}` makes a page of it",
+        f"`mjx-balance report {shell(nearby(run_dir))}{flag}` makes a page of it",
         highlight=False,
         markup=False,
         soft_wrap=True,

@@ -15,6 +15,7 @@ from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.files.run_folder import RunFolder, write_atomically, write_json
 from mjx_balance.policy.file import PolicyError, load_policy, save_policy
 from mjx_balance.report import tables
+from mjx_balance.report.progress import Stage, part
 from mjx_balance.training.loop import Run
 from mjx_balance.training.tensorboard import Board
 from mjx_balance.training.validation import (
@@ -110,8 +111,11 @@ def _hand_out(run: Run, policy: AnyPolicy) -> None:
 def finish(run: Run, policies: list[AnyPolicy], start_time: float) -> Finished:
     """Evaluates all seeds, makes the best the run's policy, writes evaluation.json, draws."""
     config, folder, console = run.config, run.folder, run.display.console
-    each = [_evaluate(run, policy, config.eval_scenarios, SEEDS.final) for policy in policies]
-    best = _choose(run, policies, each) if run.num_seeds > 1 else 0
+    seeds, suites = len(policies), len(HEADLINE)
+    stage = run.display.stages((1 if run.num_seeds == 1 else 2) * seeds * suites + run.keep)
+    scenarios = config.eval_scenarios
+    each = [_evaluate(run, policy, scenarios, SEEDS.final, stage) for policy in policies]
+    best = _choose(run, policies, each, stage) if run.num_seeds > 1 else 0
     if config.sweep:
         ranked = _ranked(config, policies, each)
         write_json(folder.sweep, ranked)
@@ -124,8 +128,8 @@ def finish(run: Run, policies: list[AnyPolicy], start_time: float) -> Finished:
     write_json(folder.evaluation, results)  # before the pictures, which may fail
     try:
         _log(results, policy.manifest["training"]["env_steps"], folder)
-        with run.display.phase("drawing figures"):
-            _draw(folder, policy, config.robot)
+        with stage("drawing figures") as bar:
+            _draw(folder, policy, config.robot, bar)
     except Exception as error:
         reason = shorten(error, MESSAGE) or type(error).__name__
         run.display.say(f"not all figures and curves are there: {reason}")
@@ -135,24 +139,25 @@ def finish(run: Run, policies: list[AnyPolicy], start_time: float) -> Finished:
     return Finished(policy, results, folder)
 
 
-def _draw(folder: RunFolder, policy: AnyPolicy, robot: str) -> None:
+def _draw(folder: RunFolder, policy: AnyPolicy, robot: str, bar: evaluation.Progress) -> None:
     from mjx_balance.report import figures, measuring  # matplotlib: not before learning begins
 
     stride = 1 + folder.metrics.stat().st_size // DRAWN_BYTES
     with folder.metrics.open(encoding="utf-8") as file:
         lines = [json.loads(line) for line in itertools.islice(file, 0, None, stride)]
     scene, seconds = evaluation.policy_scene(policy, robot), measuring.RECORD_SECONDS
-    rollout = measuring.record_rollout(policy, scene, "paper", seconds, SEEDS.record)
+    place = (scene, "paper", seconds, SEEDS.record)
+    rollout = measuring.record_rollout(policy, *place, progress=part(bar, 0, 2))
     figures.draw_figures(folder.figures, lines, policy.config.task, scene, {"policy": rollout})
 
 
-def _evaluate(run: Run, policy: AnyPolicy, scenarios: int, seed: int) -> Results:
-    """Evaluates a policy on every suite."""
-    kind = "validating" if seed == SEEDS.validation else "evaluating in plain MuJoCo"
+def _evaluate(run: Run, policy: AnyPolicy, scenarios: int, seed: int, stage: Stage) -> Results:
+    """Evaluates a policy on every suite, in plain MuJoCo."""
+    kind = "validating" if seed == SEEDS.validation else "evaluating"
     of_seed = f", seed {policy.config.seed}" if run.num_seeds > 1 else ""
     results, duration = {}, run.config.eval_duration
     for suite in HEADLINE:
-        with run.display.bar(f"{kind}, suite {suite}{of_seed}") as bar:
+        with stage(f"{kind}, suite {suite}{of_seed}") as bar:
             results[suite] = evaluation.evaluate(
                 policy, suite, scenarios, duration, seed, bar, run.config.robot
             )
@@ -166,9 +171,9 @@ def _log(results: Results, env_steps: int, folder: RunFolder) -> None:
     Board(folder.tensorboard / FINAL).write(env_steps, scalars(results))
 
 
-def _choose(run: Run, policies: list[AnyPolicy], each: list[Results]) -> int:
+def _choose(run: Run, policies: list[AnyPolicy], each: list[Results], stage: Stage) -> int:
     """Validates every seed, makes the best one the run's policy, writes seeds.json."""
-    validated = [_evaluate(run, x, CHOICE_SCENARIOS, SEEDS.validation) for x in policies]
+    validated = [_evaluate(run, x, CHOICE_SCENARIOS, SEEDS.validation, stage) for x in policies]
     best = min(range(len(policies)), key=lambda k: score(validated[k]))
     _hand_out(run, policies[best])
     seeds = [policy.config.seed for policy in policies]

@@ -61,6 +61,8 @@ class Run:
     own: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
     """Names of the user's own `network` and `loss`; None or missing: ours."""
     keep: bool = True  #: whether the folder stays after the run, so that files in it have readers
+    still: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Suite -> mean tilt of a robot that stands still, deg, to compare with."""
 
     @property
     def exportable(self) -> bool:
@@ -241,7 +243,7 @@ def _journal(run: Run, done: int) -> Iterator[Callable[..., None]]:
     folder.metrics.touch()
     # Whatever other files of TensorBoard have after `done` no longer counts.
     board = Board(folder.tensorboard, purge_step=done + 1, suffix=f".from-{done}")
-    with run.display.training(done, run.total):
+    with run.display.training(done, run.total, run.still):
 
         def write(state: TrainState, metrics: dict[str, float], seeds: dict[str, Any]) -> None:
             steps = _steps(state)

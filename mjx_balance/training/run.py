@@ -13,7 +13,8 @@ from mjx_balance.config import Config, ConfigError, flatten, to_dict
 from mjx_balance.config.serialization import check_same_config, read_run_config
 from mjx_balance.dqn import DQN, Loss, Network, TrainState
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.errors import shell
+from mjx_balance.errors import nearby, shell
+from mjx_balance.evaluation.suites import HEADLINE, SEEDS, standing_still
 from mjx_balance.files import run_folder
 from mjx_balance.files.run_folder import RunFolder, RunFolderError, RunFolderExistsError
 from mjx_balance.machine import cores
@@ -26,6 +27,7 @@ from mjx_balance.training.loop import Interrupts, Program, Run, learn, number
 from mjx_balance.training.processes import Cluster, Interrupted, Processes, joined
 from mjx_balance.training.validation import AnyPolicy, validate
 
+STILL_SCENARIOS = 32  #: by which a robot that stands still is judged
 SHARED = (ConfigError, RunFolderError, checkpoints.CheckpointError, PolicyError)
 """Errors that all processes of a run raise together."""
 
@@ -73,7 +75,8 @@ def train(
         if not processes.first:
             listeners = Callbacks()
         folder = RunFolder(Path(path))
-        run = Run(sized, env, learner, folder, display, processes, listeners, own, keep)
+        still = _standing_still(sized, env) if processes.first else {}
+        run = Run(sized, env, learner, folder, display, processes, listeners, own, keep, still)
         _announce(run)
         with _locked(run), contextlib.closing(listeners):
             listeners.on_start(sized, folder.path)
@@ -113,6 +116,13 @@ def _set_up(
             if config.num_envs is not None or learner.spec.num_envs <= sizing.CPU_ENVS:
                 raise
             most = learner.spec.num_envs // 2
+
+
+def _standing_still(config: Config, env: BalanceEnv) -> dict[str, float]:
+    """Mean tilt, deg, of a robot that stands still in the suites of a validation."""
+    task, robot = env.scene.task, env.scene.robot
+    size = (STILL_SCENARIOS, config.validation_duration, SEEDS.validation)
+    return {suite: standing_still(task, robot, suite, *size) for suite in HEADLINE}
 
 
 def provenance(env: BalanceEnv) -> dict[str, Any]:
@@ -164,7 +174,7 @@ def _announce(run: Run) -> None:
     last = config.seed + run.num_seeds - 1
     seeds = f"seed {last}" if last == config.seed else f"seeds {config.seed} to {last}"
     run.display.say(
-        f"{path}: preset {config.preset}, {seeds}, {config.num_envs} envs on "
+        f"{nearby(path)}: preset {config.preset}, {seeds}, {config.num_envs} envs on "
         f"{config.num_devices} {jax.devices()[0].device_kind} device(s)"
     )
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -151,16 +152,17 @@ def test_a_process_among_several_is_quiet_but_for_the_first(
 def test_a_report_is_of_what_was_asked_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """64 scenarios into the first folder, or what the flags say; what is missing is said."""
+    """8 scenarios into the first folder, or what the flags say; what is missing is said."""
     asked: list[Any] = []
     monkeypatch.setattr(
         "mjx_balance.report.page.write_report",
-        lambda *given: asked.append(given[:3]) or ["no video"],
+        lambda *given: asked.append((*given[:3], given[5])) or ["no video"],
     )
     assert main(["report", "a", "b"]) == 0
-    assert main("report a --out page.html --scenarios 5".split()) == 0
+    assert main("report a --out page.html --scenarios 5 --no-video".split()) == 0
     a, b = Path("a"), Path("b")
-    assert asked == [((a, b), a / "report.html", 64), ((a,), Path("page.html"), 5)]
+    first, second = ((a, b), a / "report.html", 8, True), ((a,), Path("page.html"), 5, False)
+    assert asked == [first, second]
     said = capsys.readouterr()
     assert said.out.split() == ["a/report.html", "page.html"]
     assert said.err == 2 * "mjx-balance: no video\n"
@@ -211,6 +213,7 @@ def test_what_cannot_be_resumed_is_refused(
         ("evaluate text --json no/such/out.json", "cannot write no/such/out.json"),
         ("evaluate --controller none --json .", "cannot write .: it is a folder"),
         ("evaluate --controller none --video text", "video is text; its name must"),
+        ("evaluate --controller none --video v.mp4 --video-duration 0", "video_duration is 0"),
         ("evaluate --controller none --seed -1", "seed is -1"),
         ("evaluate --controller none --scenarios 0", "scenarios is 0"),
         ("evaluate --controller none --duration 1e12", "duration 1e+12 s: that takes about"),
@@ -294,7 +297,9 @@ def test_an_evaluation_is_of_what_was_asked_for(
 
     simulate = evaluate.run_suite
     monkeypatch.setattr(evaluate, "run_suite", run_suite)
-    monkeypatch.setattr("mjx_balance.render.drawing.write", lambda *given: None)
+    drawn: list[Any] = []
+    write = lambda *given, captions, progress: drawn.append(len(captions))  # noqa: E731
+    monkeypatch.setattr("mjx_balance.render.drawing.write", write)
     assert main(["evaluate", "--controller", "none"]) == 0
     flags = "--suite push --scenarios 3 --duration 5 --seed 7 --video v.mp4"
     assert main(["evaluate", "--controller", "none", *flags.split()]) == 0
@@ -303,6 +308,12 @@ def test_an_evaluation_is_of_what_was_asked_for(
         ("push", 3, 5.0, 7, False),
         ("push", 1, 5.0, 7, True),
     ]
+    assert drawn == [50], "a caption for each of 0.2 s of states"
+    assert main(["evaluate", "--controller", "none", "--video", "v.mp4"]) == 0
+    assert asked[-1] == ("paper", 1, 20.0, 0, True), "no more than the video shows"
+    stages = re.findall(r"^(\d/\d \S+) .*\.\.\.$", capsys.readouterr().err, re.MULTILINE)
+    with_video = ["1/2 evaluating,", "2/2 drawing"]
+    assert stages == ["1/1 evaluating,", *with_video, *with_video]
 
 
 @pytest.mark.parametrize("who", [{"policy": Path("best")}, {"controller": "pd-imu"}], ids=str)

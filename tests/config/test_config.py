@@ -117,7 +117,7 @@ def test_preset_paper_has_the_papers_numbers() -> None:
     [
         ("default", "4d84e143"),
         ("best", "ccea5988"),
-        ("quick", "316a1d84"),
+        ("quick", "57c944df"),
         ("smoke", "51dacd1d"),
         ("real", "0ad9ffae"),
     ],

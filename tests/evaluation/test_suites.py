@@ -13,7 +13,7 @@ from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.evaluation.controllers import View, make_controller
 from mjx_balance.evaluation.rollout import roll_out, run_suite, suite_scene
-from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite
+from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite, standing_still
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.sim.scene import Scene, load_scene
@@ -429,3 +429,13 @@ def test_an_episode_begun_anew_is_as_noisy_as_its_generator(config: Config) -> N
     (again,) = draw(config, "noise", 1, 10.0, 6).rngs
     batch.reset(np.asarray([1]), one._replace(rngs=[again]))
     np.testing.assert_array_equal(batch.step(np.zeros((3, 2))).imu[1], imu)
+
+
+def test_a_robot_that_stands_still_tilts_as_the_board_does(config: Config, scene: Scene) -> None:
+    """The closed form is that of a simulation, falls included."""
+    size = (6, 20.0, 5)
+    for suite in ("paper", "corner"):
+        simulated = run_suite(scene, make_controller("none", scene), suite, *size)
+        still = standing_still(scene.task, scene.robot, suite, *size)
+        assert still == pytest.approx(simulated.tilt.mean(), abs=0.15)
+        assert simulated.fell.any() or suite == "paper"

@@ -81,6 +81,39 @@ def test_a_video_shows_the_states_in_order_at_real_speed(
     np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)), qpos[::stride, 0], atol=8)
 
 
+def test_captions_tell_time_board_and_tilt(scene: Scene) -> None:
+    qpos = np.tile(scene.stance.qpos, (500, 1))
+    qpos[:, scene.board_qpos] = np.radians((5.04, -2.5))
+    half = np.radians(1.25) / 2
+    qpos[-1, scene.trunk_quat] = (np.cos(half), 0, np.sin(half), 0)
+    texts = drawing.captions(scene, qpos)
+    assert len(texts) == 500
+    assert texts[24].startswith("0.1 s\tboard +5.0°, -2.5°\tbody tilt 0.0")
+    assert texts[-1].split("\t")[::2] == ["2.0 s", "body tilt 1.25°"]
+
+
+@pytest.mark.usefixtures("grey")
+def test_a_video_has_the_caption_of_its_state_above_and_tells_how_far_it_is(
+    scene: Scene, tmp_path: Path, read_video: Any
+) -> None:
+    qpos, shares = np.full((200, 1), 90.0), []
+    words = [*["a\tb\tc"] * 100, *["WWWWWWW\tWWWWWWWWW\tWWWWWWWW"] * 100]
+    video = tmp_path / "video.mp4"
+    how = {"size": (320, 192), "fps": 12.5, "progress": shares.append}
+    write(video, scene, qpos, captions=words, **how)
+    speed, frames = read_video(video)
+    assert speed == pytest.approx(12.5)
+    assert frames.shape == (10, 192, 320, 3)
+    np.testing.assert_allclose(frames[:, 30:], 90, atol=8, err_msg="the picture stays")
+    ground, letters = (frames[:, :18] < 60).mean(axis=(1, 2, 3)), frames[:, :18].max(axis=(1, 2, 3))
+    assert (ground > 0.5).all()
+    assert (letters > 150).all()
+    assert ground[:5].min() > ground[5:].max() + 0.05, "each state has its own words"
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1.0)
+    assert len(shares) == 10
+
+
 def test_no_backend_gives_one_sentence(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,7 +26,7 @@ METRICS = {
 }
 CELLS = (
     "decisions/s 1,234",
-    "mean tilt 0.250 deg",
+    "tilt exploring 0.250 deg",
     "falls per robot-minute 0.500",
     "reward 0.300",
     "loss 0.01000",
@@ -135,14 +135,71 @@ def last_panel(text: str) -> list[str]:
 
 def test_a_terminal_shows_every_number_under_its_name() -> None:
     display, out = screen(terminal=True)
-    with display.training(200, 1_000):
+    with display.training(200, 1_000, {"paper": 3.323, "corner": 5.819}):
         display.update(600, METRICS | VALIDATED)
         display.update(800, METRICS | {"train/diverged": 2.0})
     panel = last_panel(out.getvalue())
     assert panel[1].startswith(("⠋ training", "⠙ training"))
     assert "800/1000 decisions" in panel[1]
-    rows = (CELLS[:3], CELLS[3:], HELD_OUT, ("diverged envs 2",))
-    assert panel[2:6] == [" ".join(row) for row in rows]
+    speed, tilt, *others = CELLS
+    assert panel[2:4] == [" ".join((speed, others[0])), " ".join(others[1:])]
+    assert panel[4].startswith(tilt)
+    assert panel[5:] == [
+        "tilt held out paper 0.084 deg, falls 0 corner 1.250 deg, falls 2.5",
+        "standing still paper 3.32 deg corner 5.82 deg",
+        "exploring: with random actions; held out: without them, on other boards",
+        "diverged envs 2",
+        "╰" + "─" * 104 + "╯",
+    ]
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_live_lines_fit_and_leave_room_for_the_terminals_echo(width: int, clock: Any) -> None:
+    """A full line would break when Ctrl-C is echoed, and shift all that is drawn after it."""
+    out = io.StringIO()
+    display = Display(Console(file=out, force_terminal=True, width=width))
+    with display.training(0, 20_000_000, {"paper": 3.32, "corner": 5.82}):
+        display.update(10_000_000, METRICS | VALIDATED | {"eval/corner/falls": 12.25})
+    with display.stages(12)("evaluating, suite corner, seed 1234567, which is long") as bar:
+        bar(0.5)
+    lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", out.getvalue()).replace("\r", "\n").splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= width - 4
+    inside = [line.strip("│ ") for line in lines if line.startswith("│")]
+    starts = "decisions/s|reward|tilt exploring|tilt held out|standing still|exploring:".split("|")
+    assert "training" in inside[-7]
+    assert all(map(str.startswith, inside[-6:], starts)), "no row takes two lines"
+
+
+def test_the_course_of_the_tilt_is_drawn_on_a_log_scale(clock: Any) -> None:
+    display, out = screen(terminal=True)
+    with display.training(0, 1_200):  # 24 places: 50 decisions each
+        display.update(600, {"train/tilt_deg": 4.0})
+        display.update(650, {"train/tilt_deg": 1.0})
+        display.update(900, {"train/tilt_deg": 0.25})
+    line = next(x for x in last_panel(out.getvalue()) if x.startswith("tilt exploring"))
+    # 4 to 0.25 is 8 blocks; 1 is their middle, 3.5 rounded to even.
+    assert line == "tilt exploring 0.250 deg " + "█" * 12 + "▅" + "▁" * 5
+
+
+def test_stages_are_numbered_and_tell_the_time_left(clock: Any) -> None:
+    display, out = screen(terminal=False)
+    stage = display.stages(2)
+    with stage("evaluating") as bar:
+        bar(0.0)
+        clock.now += 4.9
+        bar(0.1)  # too soon
+        clock.now += 1.1
+        bar(0.25)  # 6 s for a quarter
+        bar(0.3)
+    with stage("drawing"):
+        clock.now += 1.0
+    assert out.getvalue().splitlines() == [
+        "1/2 evaluating ...",
+        "1/2 evaluating: 25%, 18 s left",
+        "1/2 evaluating: 6.0 s",
+        "2/2 drawing ...",
+        "2/2 drawing: 1.0 s",
+    ]
 
 
 def test_a_terminal_shows_a_dash_before_the_first_numbers_and_no_more_than_all() -> None:
@@ -151,7 +208,9 @@ def test_a_terminal_shows_a_dash_before_the_first_numbers_and_no_more_than_all()
         pass
     panel = last_panel(out.getvalue())
     assert "200/1000 decisions" in panel[1]
-    assert panel[2] == "decisions/s - mean tilt - falls per robot-minute -"
+    assert panel[2] == "decisions/s - falls per robot-minute -"
+    assert panel[4:6] == ["tilt exploring -", "tilt held out -"]
+    assert "standing still" not in "".join(panel)
     display, out = screen(terminal=True)
     with display.training(0, 1_000):
         display.update(1_024, METRICS)
@@ -162,20 +221,25 @@ def test_a_bar_moves_to_the_share_that_is_done() -> None:
     display, out = screen(terminal=False)
     with display.bar("evaluating") as bar:
         bar(0.5)
-    assert out.getvalue() == "evaluating ...\n"
+    assert out.getvalue().startswith("evaluating ...\nevaluating: ")
     display, out = screen(terminal=True)
     with display.bar("evaluating [bold]") as bar:
         bar(0.25)
     lines = [line for line in plain(out.getvalue()) if "evaluating [bold] " in line]
-    assert re.findall("(━+)╺━", lines[-1]) == ["━" * 10], "a quarter of 40"
+    done, left = re.findall("(━+)[╺╸](━+)", lines[-1])[0]
+    assert len(done) / (len(done) + len(left)) == pytest.approx(0.25, abs=0.03)
+    assert plain(out.getvalue())[-1].startswith("evaluating [bold]: ")
 
 
 def test_messages_are_printed_as_they_are() -> None:
-    """Neither wrapped nor taken for markup."""
+    """Neither wrapped nor taken for markup; a terminal gets whole words, and paths to copy."""
+    message = "stopped; continue with --resume /[bold]" + "x" * 120 + " or do not"
     display, out = screen(terminal=False)
-    message = "a path /[bold]" + "x" * 120
     display.say(message)
     assert out.getvalue() == f"{message}\n"
+    display, out = screen(terminal=True)
+    display.say(message)
+    assert out.getvalue().splitlines() == [message[:31], message[32:-10], "or do not"]
 
 
 @pytest.mark.parametrize("kind", ["pipe", "terminal", "full disk"])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -117,7 +118,7 @@ def test_learning_curves_show_validations_as_points_beside_the_tilt() -> None:
     np.testing.assert_allclose(data(axes[0], 2), [(2, 0.75)])
     assert [line.get_linestyle() for line in axes[0].get_lines()] == ["-", "None", "None"]
     legend = axes[0].get_legend().get_texts()
-    assert [x.get_text() for x in legend] == ["held out, paper", "held out, corner"]
+    assert [x.get_text() for x in legend] == ["exploring", "held out, paper", "held out, corner"]
     assert [len(axis.get_lines()) for axis in axes] == [3, 1, 1, 1, 1, 1]
     bare = figures.learning_curves([[metrics_line(1_000, [1.0] * 6)]]).axes[0]
     assert bare.get_legend() is None
@@ -146,10 +147,20 @@ def test_tilt_figure_shows_the_share_beyond_each_tilt() -> None:
     np.testing.assert_allclose(policy[:, 0], [0.1, 1.0, 2.0, 5.0])
     np.testing.assert_allclose(policy[:, 1], [0.5, 0.2, np.nan, np.nan])
     np.testing.assert_allclose(none[:, 1], [1.0, 1.0, 1.0, np.nan])
-    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["policy", "none"]
+    labels = {text.get_text(): text for text in axis.texts}
+    heights = {name: label.get_position()[1] for name, label in labels.items()}
+    assert heights["none"] > heights["policy"] + 0.08, "the farthest on top, none over another"
+    for name, line in zip(("policy", "none"), axis.get_lines()[:2], strict=True):
+        assert labels[name].get_color() == line.get_color()
+        assert labels[name].xy in [tuple(point) for point in np.asarray(line.get_xydata())]
+    dashes = {line.get_linestyle() for line in axis.get_lines()[:2]}
+    colours = {line.get_color() for line in axis.get_lines()[:2]}
+    assert len(colours) == 2
+    assert dashes == {"-"}
     assert axis.get_lines()[0].get_linewidth() > axis.get_lines()[1].get_linewidth()
     assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
     assert axis.get_xlim() == (0.02, 5.0)
+    assert axis.get_ylim()[1] > 1, "a curve that stays at 1 is seen"
     assert axis.get_xlabel() == "body tilt [deg]"
 
 
@@ -175,6 +186,9 @@ def test_envelope_figure_has_speed_to_the_right_and_incline_upward() -> None:
         assert axis.get_title(loc="left") == title
         assert axis.get_xlabel() == "board speed on each axis [deg/s]"
     assert left.get_ylabel() == "board angle on both axes at once [deg]"
+    (legend,) = figure.legends
+    (text,) = legend.get_texts()
+    assert text.get_text().startswith("to the right or above: out of reach")
 
 
 def made_up_rollout(
@@ -206,25 +220,85 @@ def made_up_rollout(
 
 
 def test_rollout_figure_shows_each_angle_in_its_row(config: Config, scene: Scene) -> None:
-    standing, angles = made_up_rollout(config, scene, fell_at=5_500)
-    fallen, others = made_up_rollout(config, scene, fell_at=5_499, level=1.5)
-    figure = figures.rollout_figure(scene, {"policy": standing, "none": fallen})
-    axes = np.asarray(figure.axes).reshape(4, 2)
-    for row, name in enumerate(("board X", "board Y", "body roll", "body pitch")):
-        for axis, expected in zip(axes[row], (angles, others), strict=True):
-            curve = data(axis)
-            np.testing.assert_allclose(curve[:, 0], expected["time"])
-            np.testing.assert_allclose(curve[:, 1], expected[name], atol=1e-9)
-            dotted = [line for line in axis.get_lines() if line.get_linestyle() == ":"]
-            changes = [np.asarray(line.get_xdata(), float)[0] for line in dotted]
-            assert changes == [0, 10, 20], "a new target every 10 s"
-            assert axis.get_ylim() == pytest.approx((-7.35, 7.35)), "the steepest board fits"
-        assert [axis.get_ylabel() for axis in axes[row]] == [f"{name} [deg]", ""]
-    assert [axis.get_title(loc="left") for axis in axes[0]] == [
-        "policy: mean tilt 0.40 deg, greatest 1.00 deg",  # a fifth of the time 1, else 0.25
-        "none: mean tilt 0.40 deg, greatest 1.00 deg, the robot fell",
+    policy, angles = made_up_rollout(config, scene, fell_at=5_500)
+    other, others = made_up_rollout(config, scene, fell_at=5_500, level=1.5)
+    figure = figures.rollout_figure(scene, {"policy": policy, "pd-imu": other})
+    board, roll, pitch, tilt = figure.axes
+    time = angles["time"]
+    for axis, values in (
+        (board, [angles["board X"], angles["board Y"]]),
+        (roll, [angles["body roll"], others["body roll"]]),
+        (pitch, [angles["body pitch"], others["body pitch"]]),
+    ):
+        for line, expected in enumerate(values):
+            curve = data(axis, line)
+            np.testing.assert_allclose(curve[:, 0], time)
+            np.testing.assert_allclose(curve[:, 1], expected, atol=1e-9)
+    for axis in figure.axes:
+        dotted = [line for line in axis.get_lines() if line.get_linestyle() == ":"]
+        changes = [np.asarray(line.get_xdata(), float)[0] for line in dotted]
+        assert changes == [0, 10, 20], "a new target every 10 s"
+    # The greatest of both: 1.5 deg of roll, -1.3 of pitch; not that of the board.
+    for axis in (roll, pitch):
+        assert axis.get_ylim() == pytest.approx((-1.65, 1.65), abs=1e-3)
+    x, y = np.radians(angles["board X"]), np.radians(angles["board Y"])
+    still = np.degrees(np.arccos(np.cos(x) * np.cos(y)))
+    np.testing.assert_allclose(data(tilt, 0)[:, 1], still, atol=1e-6)
+    np.testing.assert_allclose(data(tilt, 1)[:, 1], policy.tilt[0])
+    assert tilt.get_yscale() == "log"
+    assert tilt.get_ylim()[1] > 7, "the steepest board fits"
+    assert [axis.get_ylabel() for axis in figure.axes] == [
+        *("board [deg]", "body roll [deg]", "body pitch [deg]", "tilt [deg]")
     ]
-    assert axes[3, 0].get_xlabel() == "time [s]; dotted: the board takes a new target"
+    assert {text.get_text() for text in board.texts} == {"X", "Y"}
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == [
+        f"standing still (the board's tilt): mean {still.mean():.2f}, max {still.max():.2f} deg",
+        "policy: mean 0.400, max 1.00 deg",  # a fifth of the time 1, else 0.25
+        "pd-imu: mean 0.400, max 1.00 deg",
+    ]
+    assert tilt.get_xlabel() == "time [s]; dotted: the board takes a new target"
+
+
+def test_a_fall_of_another_does_not_flatten_the_policys_angles(
+    config: Config, scene: Scene
+) -> None:
+    policy, _ = made_up_rollout(config, scene, fell_at=5_500)
+    other, _ = made_up_rollout(config, scene, fell_at=5_499)
+    other.qpos[0, :, scene.trunk_quat[1]] += 0.5  # pyright: ignore[reportOptionalSubscript]
+    figure = figures.rollout_figure(scene, {"policy": policy, "none": other})
+    assert figure.axes[1].get_ylim() == pytest.approx((-1.65, 1.65), abs=1e-3)
+    assert figure.legends[0].get_texts()[-1].get_text().endswith("max 1.00 deg, falls")
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of `#rrggbb`, 0 to 1 (WCAG 2.2)."""
+    values = np.asarray([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def test_every_colour_is_seen_on_both_grounds() -> None:
+    """A contrast of at least 3 to 1, as WCAG 2.2 asks of graphics."""
+    for light, dark in figures.DARK.items():
+        assert 1.05 / (luminance(light) + 0.05) >= 3, light
+        assert (luminance(dark) + 0.05) / (luminance("#12161c") + 0.05) >= 3, dark
+
+
+def test_an_svg_has_no_colour_that_only_a_light_page_shows(config: Config) -> None:
+    text = figures.svg(figures.reward_figure(config.task)).decode()
+    style = re.findall(r"<style>(.*?)</style>", text)[0]
+    light, dark = style.split("@media(prefers-color-scheme:dark)")
+    for name, colour in enumerate(figures.DARK):
+        assert f"--c{name}:{colour};" in light
+        assert f"--c{name}:{figures.DARK[colour]};" in dark
+    rest = text.replace(style, "")
+    colours = set(re.findall(r"#[0-9a-f]{6}\b", rest)) - {"#000000", "#ffffff"}
+    assert not colours, "all are variables"
+    assert f"var(--c{list(figures.DARK).index(figures.BLUE)})" in rest
+    assert "fill: #ffffff" not in rest, "no white ground"
+    again = figures.svg(figures.reward_figure(config.task)).decode()
+    assert again == text, "the same file from the same figure"
 
 
 def test_a_runs_figures_are_drawn_from_what_they_are_given(
@@ -237,7 +311,7 @@ def test_a_runs_figures_are_drawn_from_what_they_are_given(
     assert [file.name for file in files] == ["learning_curves.png", "reward.png", "rollout.png"]
     assert sorted(folder.iterdir()) == sorted(files)
     sizes = [imageio.imread(file).shape[:2] for file in files]
-    for (height, width), (tall, wide) in zip(sizes, ((6, 12), (3.4, 9), (7, 11)), strict=True):
+    for (height, width), (tall, wide) in zip(sizes, ((6, 12), (3.4, 9), (7.6, 11)), strict=True):
         assert 140 * wide < width < 160 * wide, "150 dots per inch"
         assert 140 * tall < height < 160 * tall
 

@@ -16,7 +16,7 @@ from mjx_balance.evaluation.envelope import Envelope
 from mjx_balance.evaluation.rollout import Rollout
 from mjx_balance.policy.file import Policy, load_policy
 from mjx_balance.report import measuring
-from mjx_balance.report.measuring import Measurements, code, code_digest, load_or_measure
+from mjx_balance.report.measuring import Measurements, code, code_digest
 from mjx_balance.report.reading import FOREIGN
 from mjx_balance.sim.scene import Scene, load_scene
 
@@ -41,10 +41,14 @@ def measure(
 ) -> Callable[..., Measurements]:
     """Measures, or reads what `report.json` in the test's folder holds."""
 
+    def stage(title: str) -> Any:
+        return contextlib.nullcontext(lambda share: None)
+
     def run(scenarios: int, policy: Policy = policy) -> Measurements:
         file = tmp_path / "report.json"
-        no_bar = lambda title: contextlib.nullcontext(lambda share: None)  # noqa: E731
-        return load_or_measure(policy, its_scene, file, scenarios, no_bar)
+        return measuring.load(policy, its_scene, file, scenarios) or measuring.measure(
+            policy, its_scene, file, scenarios, stage
+        )
 
     return run
 
@@ -63,7 +67,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
         fell_at = np.arange(scenarios) + 3  # the first falls in the last step
         return Rollout(scene.task, tilt, fell_at, np.zeros((scenarios, 1)), None, 1.0)
 
-    def envelope(scene, controller, scenarios, duration, seed, *more):
+    def envelope(scene, controller, scenarios, duration, seed, *more, inclines, rates):
+        assert (len(inclines), len(rates)) == (6, 6)
         asked.append((controller, "envelope", scenarios, duration, seed, False))
         return dataclasses.replace(MAPPED, scenarios=scenarios, duration_s=duration, seed=seed)
 
@@ -79,11 +84,11 @@ def test_everyone_is_measured_on_the_same_scenarios(
 ) -> None:
     found = measure(5)
     *suites, mapped = calls
-    assert [call[1] for call in suites] == ["paper", "corner"] * 6
+    assert [call[1] for call in suites] == ["paper"] * 6 + ["corner"] * 6
     assert {call[2:] for call in suites} == {(5, 60.0, 4_000_000, False)}
     assert mapped[1:] == ("envelope", 2, 30.0, 4_000_000, False)
-    assert [call[0] for call in suites[2:]] == [
-        f"{name} {2 * k + n}" for k, name in enumerate(NAMES) if k for n in range(2)
+    assert [call[0] for call in suites if isinstance(call[0], str)] == [
+        f"{name} {6 * n + k}" for n in range(2) for k, name in enumerate(NAMES) if k
     ], "each suite gets a fresh controller: some have a memory"
     obs = np.zeros((1, policy.observation_size), np.float32)
     view = type("View", (), {"obs": obs})
@@ -93,7 +98,7 @@ def test_everyone_is_measured_on_the_same_scenarios(
     for k, name in enumerate(NAMES):
         for n, suite in enumerate(("paper", "corner")):
             result = found.results[name][suite]
-            least = 0.001 * (2 * k + n + 1)
+            least = 0.001 * (6 * n + k + 1)
             assert result["tilt_deg"]["mean"] == pytest.approx((2 * least + 9) / 4)
             assert (result["scenarios"], result["falls"]) == (5, 1)
 
@@ -129,21 +134,24 @@ def test_what_was_measured_is_kept(
         monkeypatch.setattr(measuring, name, value)
         measure(6)
         assert len(calls) == k * 13, name
+    monkeypatch.setitem(measuring.ENVELOPE_GRID, "rates", (2.0, 2.5, 3.0, 3.5, 4.0, 5.0))
+    measure(6)
+    assert len(calls) == 6 * 13, "another map"
     weights = safetensors.numpy.load_file(SHIPPED)
     scaled = {name: (1.001 * value).astype(np.float32) for name, value in weights.items()}
     other = Policy(policy.manifest, scaled)
     measure(6, other)
-    assert len(calls) == 6 * 13, "another network"
+    assert len(calls) == 7 * 13, "another network"
     task = dataclasses.replace(policy.config.task, action_ramp=0.3)
     other.config = dataclasses.replace(policy.config, task=task)
     measure(6, other)
-    assert len(calls) == 7 * 13, "the same network in another task"
+    assert len(calls) == 8 * 13, "the same network in another task"
     monkeypatch.setattr(measuring, "code_digest", lambda: "other")
     measure(6, other)
-    assert len(calls) == 8 * 13, "other code"
+    assert len(calls) == 9 * 13, "other code"
     monkeypatch.setattr(Scene, "hash", "of another board")
     measure(6, other)
-    assert len(calls) == 9 * 13, "another scene"
+    assert len(calls) == 10 * 13, "another scene"
 
 
 HOSTILE = "<img src=x onerror=alert(1)>"

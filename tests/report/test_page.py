@@ -1,6 +1,7 @@
 """The HTML report: complete, honest about what is missing, and quiet in a browser."""
 
 import base64
+import contextlib
 import copy
 import dataclasses
 import html
@@ -25,6 +26,7 @@ from mjx_balance.policy.network import Policy
 from mjx_balance.render.drawing import RenderError
 from mjx_balance.report import figures, measuring, page, reading
 from mjx_balance.report.measuring import NAMES, Measurements
+from mjx_balance.report.page import Picture
 from mjx_balance.report.reading import Run
 from mjx_balance.sim.scene import Scene
 
@@ -34,6 +36,7 @@ SHORTER = {
     "DURATION": 3.0,
     "ENVELOPE_SCENARIOS": 1,
     "ENVELOPE_DURATION": 1.0,
+    "ENVELOPE_GRID": {"inclines": (2.0, 8.0), "rates": (2.5, 5.0)},
     "RECORD_SECONDS": 12.0,
     "VIDEO_SECONDS": 1.0,
 }
@@ -98,7 +101,9 @@ def test_everything_is_there_and_nothing_from_elsewhere(run: Path, written: Path
     assert "mjx-balance train --preset default --seed 0 " in text
     assert " --num-seeds 2" in text
     assert "<td>0.150 (0.100-0.200)</td><td>0.200</td>" in text, "over the two seeds"
-    assert text.count("data:image/png;base64,") == 6
+    assert text.count("data:image/svg+xml;base64,") == 6
+    for alt in re.findall(r'<img alt="(.*?)"', text):
+        assert re.search(r"\d", alt), "it says what is seen"
     assert "data:video/mp4;base64," in text
     results = json.loads((run / "report.json").read_text())["results"]
     for row, suites in zip(tables(text)[0][2:], results.values(), strict=True):
@@ -126,7 +131,8 @@ def tables(text: str) -> list[list[list[str]]]:
 
 BLANK = {"title": "x", "missing": [], "policy": None, "video": None, "training": {}}
 BLANK |= {"config": None, "commands": [], "versions": ""}
-PICTURES = dict.fromkeys(("paper", "corner", "tilt", "envelope"), "AAAA")
+PICTURE = Picture("seen", "AAAA")
+PICTURES = dict.fromkeys(("paper", "corner", "tilt", "envelope"), PICTURE)
 
 
 def made_up(policy: Policy) -> Measurements:
@@ -180,11 +186,11 @@ def test_the_table_of_baselines_and_the_tiles(policy: Policy) -> None:
         ("1", "falls in 80 scenarios of 60 s"),
         ("75%", "of the feasible envelope free of falls"),
     ]
-    assert "Plain MuJoCo, 40 held-out scenarios of 60 s per suite (seed 4000000)" in text
-    captions = html.unescape("|".join(re.findall(r"<img alt.*?<p>(.*?)</p>", text)))
-    assert "suite paper (targets in any direction), beside the PD" in captions
+    assert "Plain MuJoCo, 40 held-out scenarios of 60 s per suite and row (seed 4000000; " in text
+    captions = html.unescape("|".join(re.findall(r"<img alt.*?</div><p>(.*?)</p>", text)))
+    assert "suite paper (targets in any direction): one scenario, beside the PD" in captions
     assert "suite corner (both axes at once, the case the paper's" in captions
-    assert "|Suite paper, every physics step of every scenario.|" in captions
+    assert "|Suite paper, every physics step of 40 scenarios of 60 s per curve. A curve" in captions
     assert "|Targets on both axes at once, 3 scenarios of 31 s per cell. Right" in captions
     assert "3 mm 5 times a second turn the body at 4.46 deg/s in pitch" in captions
     assert captions.endswith("the legs reach 10.3 deg. Inside, 75% of the cells are free of falls.")
@@ -212,11 +218,21 @@ def test_the_pictures_of_a_policy(
         monkeypatch.setattr(
             figures, name, lambda *given, name=name: drawn.append(given) or name.encode()
         )
-    monkeypatch.setattr(figures, "png", lambda figure: figure)
-    monkeypatch.setattr(measuring, "record_rollout", lambda *given: given)
+    monkeypatch.setattr(figures, "svg", lambda figure: figure)
+    monkeypatch.setattr(page.alt_texts, "rollout_alt", lambda suite, rollouts: f"of {suite}")
+
+    def record(*given: Any) -> tuple:
+        *of, progress = given
+        progress(1.0)
+        return tuple(of)
+
+    monkeypatch.setattr(measuring, "record_rollout", record)
     measurements = made_up(policy)
-    pictures = page.policy_pictures(policy, scene, measurements)
-    assert {name: base64.b64decode(png).decode() for name, png in pictures.items()} == {
+    shares_done: list[float] = []
+    pictures = page.policy_pictures(policy, scene, measurements, shares_done.append)
+    assert shares_done == pytest.approx([0.2, 0.4, 0.6, 0.8]), "drawing takes the last fifth"
+    assert [pictures[suite].alt for suite in ("paper", "corner")] == ["of paper", "of corner"]
+    assert {name: base64.b64decode(x.svg).decode() for name, x in pictures.items()} == {
         "paper": "rollout_figure",
         "corner": "rollout_figure",
         "tilt": "tilt_figure",
@@ -241,14 +257,21 @@ def test_the_video_is_of_a_scenario_that_was_measured(
         asked.append(given)
         return types.SimpleNamespace(qpos=np.arange(6.0).reshape(1, 3, 2))
 
-    def write(file: Path, config: Config, qpos: np.ndarray) -> None:
+    def write(file: Path, scene: Scene, qpos: np.ndarray, **how: Any) -> None:
         assert qpos.tolist() == [[0, 1], [2, 3], [4, 5]]
+        assert how == {"captions": "words", "progress": print, "size": (640, 368), "fps": 10.0}
         file.write_bytes(b"film")
 
     monkeypatch.setattr(measuring, "record_rollout", recorded)
+    monkeypatch.setattr(page.render, "captions", lambda scene, states: "words")
     monkeypatch.setattr(page.render, "write", write)
-    assert base64.b64decode(page.video(policy, scene)) == b"film"
-    assert asked == [(policy, scene, "corner", 12.0, 4_000_000)]
+    assert base64.b64decode(page.video(policy, scene, print)) == b"film"
+    assert asked == [(policy, scene, "corner", 8.0, 4_000_000)]
+
+
+def stage(title: str) -> Any:
+    """A stage that nobody watches."""
+    return contextlib.nullcontext(lambda share: None)
 
 
 @pytest.mark.slow
@@ -261,10 +284,10 @@ def test_the_first_run_that_has_a_policy_is_shown(
         asked.append(given)
         return made_up(policy)
 
-    def no_video(policy: Policy, scene: Scene) -> str:
+    def no_video(policy: Policy, scene: Scene, bar: Any) -> str:
         raise RenderError("no screen")
 
-    monkeypatch.setattr(measuring, "load_or_measure", measured)
+    monkeypatch.setattr(measuring, "measure", measured)
     monkeypatch.setattr(page, "policy_pictures", lambda *given: PICTURES)
     monkeypatch.setattr(page, "video", no_video)
     half = tmp_path / "half"
@@ -275,9 +298,13 @@ def test_the_first_run_that_has_a_policy_is_shown(
     other = tmp_path / "other"
     shutil.copytree(run, other)
     out = tmp_path / "out.html"
-    missing = page.write_report([half, run, other], out, 7, print)
-    assert asked == [(run / "report.json", 7, print)]
+    totals: list[int] = []
+    missing = page.write_report([half, run, other], out, 7, lambda n: totals.append(n) or stage)
+    assert asked == [(run / "report.json", 7, stage)]
+    assert totals == [5], "two suites, the envelope, figures, video"
     assert "no video: no screen" in missing
+    assert page.write_report([run], out, 7, lambda n: totals.append(n) or stage, None, False) == []
+    assert totals[1] == 4, "nobody has asked for a video, and none is missing"
     assert f"{half / 'policy.safetensors'} is missing" in missing
     text = out.read_text()
     assert "<title>mjx_balance: half, run, other</title>" in text
@@ -352,7 +379,7 @@ def test_the_reward_is_said_to_be_taken_where_it_is(config: Config) -> None:
     for where, words in (("end", "at the decision&#39;s end."), ("mean", "averaged over it.")):
         task = dataclasses.replace(config.task, reward_tilt=where)
         values = page.config_tables(dataclasses.replace(config, task=task))
-        text = page.render_page(BLANK | {"config": values, "training": {"reward": "AAAA"}})
+        text = page.render_page(BLANK | {"config": values, "training": {"reward": PICTURE}})
         assert f"the tilt is taken {words}</p>" in text
 
 
@@ -404,14 +431,14 @@ def test_nothing_that_the_template_is_given_becomes_html(
         title=HOSTILE,
         missing=[HOSTILE],
         seeds={HOSTILE: statistics},
-        pictures=dict.fromkeys(PICTURES, HOSTILE),
+        pictures=dict.fromkeys(PICTURES, Picture(HOSTILE, HOSTILE)),
         video=HOSTILE,
-        training={"curves": HOSTILE, "reward": HOSTILE},
+        training=dict.fromkeys(("curves", "reward"), Picture(HOSTILE, HOSTILE)),
         config={"differs": [(HOSTILE,) * 3], "reward_tilt": HOSTILE, "everything": HOSTILE},
         commands=[HOSTILE],
         versions=HOSTILE,
     )
-    assert text.count("&lt;script&gt;alert(2)") == 20, "every value is there, as text"
+    assert text.count("&lt;script&gt;alert(2)") == 26, "every value is there, as text"
     assert "<script" not in text
     assert "<img src=x" not in text
     assert "49" not in re.sub(r"#\w+", "", text), "nor a template"
@@ -445,7 +472,7 @@ def test_a_hostile_run_folder_injects_nothing(
     hostile = copy.copy(policy)
     hostile.manifest = policy.manifest | {"versions": {HOSTILE: HOSTILE, "\ud800": "\ud800"}}
     monkeypatch.setattr(reading, "load_policy", lambda path: hostile)
-    monkeypatch.setattr(measuring, "load_or_measure", lambda *given: made_up(policy))
+    monkeypatch.setattr(measuring, "measure", lambda *given: made_up(policy))
     monkeypatch.setattr(page, "policy_pictures", lambda *given: PICTURES)
     monkeypatch.setattr(page, "video", lambda *given: "")
     assert main(("report", str(folder))) == 0
@@ -474,7 +501,7 @@ def browser() -> str:
     return found or pytest.skip("no Chromium on this machine; Debian's package is chromium")
 
 
-def browse(browser: str, page: str, folder: Path) -> tuple[str, set[str], Path]:
+def browse(browser: str, page: str, folder: Path, *more: str) -> tuple[str, set[str], Path]:
     """Opens a page; returns what the browser logs, the addresses it asks for, a picture."""
     shot, log = folder / "page.png", folder / "net.json"
     flags = (
@@ -484,7 +511,7 @@ def browse(browser: str, page: str, folder: Path) -> tuple[str, set[str], Path]:
     ).split()
     files = [f"--user-data-dir={folder / 'profile'}", f"--log-net-log={log}"]
     done = subprocess.run(
-        [browser, *flags, *files, f"--screenshot={shot}", page],
+        [browser, *flags, *more, *files, f"--screenshot={shot}", page],
         capture_output=True,
         text=True,
         timeout=120,
@@ -507,6 +534,37 @@ def test_a_browser_shows_it_without_errors_or_requests(
     picture = np.asarray(imageio.imread(shot))
     assert picture.shape[:2] == (2400, 1280)
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 500, "it is not blank"
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_dark_page_is_dark_with_its_figures(
+    browser: str, written: Path, tmp_path: Path, dark: bool
+) -> None:
+    flags = ("--blink-settings=preferredColorScheme=0",) if dark else ()
+    *_, shot = browse(browser, written.as_uri(), tmp_path, *flags)
+    brightness = np.asarray(imageio.imread(shot))[..., :3].mean(axis=-1)
+    bright = (brightness > 128).mean()
+    assert bright < 0.2 if dark else bright > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_no_page_is_wider_than_a_phone(browser: str, written: Path, tmp_path: Path) -> None:
+    """Tables and figures scroll in boxes of their own."""
+    frame, wide = tmp_path / "phone.html", "<p style='width: 500px'>wide</p>"
+    for text, width in ((written.read_text(), "390"), (wide, "508")):
+        frame.write_text(
+            "<title></title><style>iframe { border: 0 }</style><iframe width=390 height=800 "
+            "onload='document.title = this.contentDocument.documentElement.scrollWidth' "
+            f'srcdoc="{html.escape(text)}"></iframe>'
+        )
+        profile = f"--user-data-dir={tmp_path / 'profile'}"
+        flags = ("--headless", "--no-sandbox", "--disable-gpu", profile, "--dump-dom")
+        command = [browser, *flags, frame.as_uri()]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+        assert re.findall("<title>(.*?)</title>", done.stdout)[0] == width
 
 
 @pytest.mark.slow

@@ -74,12 +74,24 @@ def test_the_summary_names_every_file_of_the_run() -> None:
     run = Path("runs/a[b]")
     tables.print_summary(Console(width=80, file=out), run, {"corner": CORNER}, 61.6, "go2")
     text = out.getvalue()
+    assert "\nruns/a[b]/\n" in text
     for name in ("policy.safetensors", "evaluation.json", "figures/", "metrics.jsonl"):
-        assert f"runs/a[b]/{name}" in text
-    assert "runs/a[b]/checkpoints/  the whole training state" in text
+        assert f"\n  {name}  " in text
+    assert "\n  checkpoints/  the whole training state\n" in text
     assert "`mjx-balance report 'runs/a[b]'` makes a page of it" in text
     assert "0.068" in text
     assert text.endswith("done in 62 s\n")
+
+
+def test_the_summary_of_a_run_fits_80_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the folder's usual name, below the working folder."""
+    monkeypatch.chdir(tmp_path)
+    run, out = tmp_path / "runs" / "default-seed0-20260102-030405", io.StringIO()
+    tables.print_summary(Console(width=80, file=out), run, {"corner": CORNER}, 61.6, "go2")
+    assert "\nruns/default-seed0-20260102-030405/\n" in out.getvalue()
+    assert max(map(len, out.getvalue().splitlines())) <= 80
 
 
 @pytest.mark.parametrize("robot", ["my robot.toml", "menagerie:unitree_h1", "go2"])

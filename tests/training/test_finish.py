@@ -118,7 +118,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
             falls, mean = 7, 1 - mean
         return result(suite, falls, mean, seed)
 
-    def draw(folder: RunFolder, policy: Policy, robot: str) -> None:
+    def draw(folder: RunFolder, policy: Policy, robot: str, bar: Any) -> None:
         assert robot == CONFIG.robot
         assert load_policy(folder.policy).fingerprint == policy.fingerprint
         assert folder.evaluation.exists()
@@ -194,11 +194,17 @@ def test_figures_are_of_the_metrics_and_of_a_scenario_of_their_own(
     [policy] = export(1.0)
     folder.metrics.write_text('{"env_steps": 1}\n{"env_steps": 2}\n')
     drawn: list[Any] = []
-    record = lambda policy, *given: (policy.fingerprint, *given)  # noqa: E731
+
+    def record(policy: Policy, *given: Any, progress: Any) -> tuple:
+        progress(1.0)
+        return policy.fingerprint, *given
+
     monkeypatch.setattr(measuring, "record_rollout", record)
     monkeypatch.setattr(figures, "draw_figures", lambda *given: drawn.append(given))
     monkeypatch.setattr(finish.evaluation, "policy_scene", lambda policy, robot: robot)
-    finish._draw(folder, policy, "rex.toml")
+    shares: list[float] = []
+    finish._draw(folder, policy, "rex.toml", shares.append)
+    assert shares == [0.5], "drawing takes the rest"
     rollouts = {"policy": (policy.fingerprint, "rex.toml", "paper", 100.0, 2_000_000)}
     lines = [{"env_steps": 1}, {"env_steps": 2}]
     assert drawn == [(folder.figures, lines, CONFIG.task, "rex.toml", rollouts)]
