@@ -11,7 +11,7 @@ from pathlib import Path
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from mjx_balance import load_policy
 from mjx_balance.config import preset
@@ -89,15 +89,17 @@ def balance() -> None:
     """Writes balance.webp: the shipped policy beside a robot that stands still, tilt over time."""
     policy = load_policy(HERE.parent / "policies" / "best.safetensors")
     scene = policy_scene(policy)
-    names, controllers = ("stands still", "policy"), (make_controller("none", scene), observing(policy))
+    names, controllers = (
+        ("stands still", "policy"),
+        (make_controller("none", scene), observing(policy)),
+    )
     rollouts = [
         run_suite(scene, controller, "corner", 1, ANIMATION_S, SEEDS.held_out, record=True)
         for controller in controllers
     ]
     dt = scene.task.sim_dt
     time = dt * np.arange(1, rollouts[0].tilt.shape[1] + 1)
-    width, height = ANIMATION_SIZE
-    figure, axis = plt.subplots(figsize=(2 * width / 100, 1.7), dpi=100)
+    figure, axis = plt.subplots(figsize=(ANIMATION_SIZE[0] / 50, 1.7), dpi=100)
     lines = [
         axis.plot([], [], color=color, linewidth=2, label=name)[0]
         for name, color in zip(names, (RED, BLUE), strict=True)
@@ -105,12 +107,15 @@ def balance() -> None:
     axis.set(xlim=(0, ANIMATION_S), ylim=(0, 6.5), xlabel="time [s]", ylabel="body tilt [deg]")
     axis.axhline(scene.task.fail_tilt, color=GREY, linestyle=":")
     axis.text(0.1, scene.task.fail_tilt - 0.15, "a fall", color=GREY, va="top")
-    axis.legend(frameon=False, loc="center left", bbox_to_anchor=(0.02, 0.5))
+    axis.legend(frameon=False, loc="center", ncols=2)
     figure.tight_layout()
     frames, stride = [], round(1 / (ANIMATION_FPS * dt))
     with contextlib.closing(Painter(scene, ANIMATION_SIZE)) as painter:
         for step in range(0, len(time), stride):
-            bodies = [painter.draw(rollout.qpos[0, step]) for rollout in rollouts]
+            bodies = [
+                labelled(painter.draw(rollout.qpos[0, step]), name, rollout.fell_at[0] <= step)
+                for name, rollout in zip(names, rollouts, strict=True)
+            ]
             for line, rollout in zip(lines, rollouts, strict=True):
                 line.set_data(time[:step], rollout.tilt[0, :step])
             figure.canvas.draw()
@@ -126,6 +131,14 @@ def balance() -> None:
         quality=60,
         method=6,
     )
+
+
+def labelled(picture: np.ndarray, name: str, fallen: bool) -> np.ndarray:
+    """The picture with a robot's name on it; a robot that has fallen is not simulated any more."""
+    image = Image.fromarray(picture)
+    words, font = f"{name}: fallen" if fallen else name, ImageFont.load_default(18)
+    ImageDraw.Draw(image).text((12, 10), words, RED if fallen else "#10202c", font)
+    return np.asarray(image)
 
 
 def main() -> None:
