@@ -6,7 +6,7 @@ the evaluation after training. `docs/paper.png` is `figures/rollout.png` of the 
     for seed in 0 1 2; do python train.py --preset paper --engine mujoco --num-devices 1 \
         --log-every 1600 --eval-every 40000 --eval-scenarios 256 --seed $seed \
         --run-dir runs/paper-$seed; done
-    python benchmarks/paper.py runs/paper-? [--write README.md]
+    python benchmarks/paper.py runs/paper-? [--write docs/results.md]
 """
 
 import json

@@ -5,7 +5,7 @@ that gave it, so that an interrupted run goes on where it stopped. A result that
 stands if its first scenarios give the same mean tilt again, to a millionth of a degree, as machines
 round differently; otherwise it is measured again.
 
-    python benchmarks/results.py policies/seeds/*.safetensors --write README.md
+    python benchmarks/results.py policies/seeds/*.safetensors --write docs/results.md
 """
 
 import functools

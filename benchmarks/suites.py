@@ -1,6 +1,6 @@
 """How do policies do where sensors, servos and boards are as on a robot? Every suite, one table.
 
-python benchmarks/suites.py best real [--write README.md]
+python benchmarks/suites.py best real [--write docs/results.md]
 """
 
 import common

@@ -1,14 +1,24 @@
-"""Draws decision.svg and radial.svg from the code they show: python docs/figures.py."""
+"""Draws the pictures of these pages from the code that they show: python docs/figures.py [NAME].
 
+decision.svg, radial.svg; balance.webp, which needs an OpenGL backend (EGL or OSMesa).
+"""
+
+import contextlib
 import itertools
+import sys
 from pathlib import Path
 
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from mjx_balance import load_policy
 from mjx_balance.config import preset
+from mjx_balance.evaluation.controllers import make_controller
+from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
+from mjx_balance.evaluation.suites import SEEDS
+from mjx_balance.render.drawing import Painter
 from mjx_balance.report import figures
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.task.kinematics import ramp
@@ -68,13 +78,76 @@ def radial() -> plt.Figure:
     return figure
 
 
+ANIMATION_FPS, ANIMATION_S, ANIMATION_SIZE = 10, 14.0, (400, 300)
+
+
+def balance() -> None:
+    """Writes balance.webp: the shipped policy beside a robot that stands still, tilt over time."""
+    policy = load_policy(HERE.parent / "policies" / "best.safetensors")
+    scene = policy_scene(policy)
+    names, controllers = (
+        ("stands still", "policy"),
+        (make_controller("none", scene), observing(policy)),
+    )
+    rollouts = [
+        run_suite(scene, controller, "corner", 1, ANIMATION_S, SEEDS.held_out, record=True)
+        for controller in controllers
+    ]
+    dt = scene.task.sim_dt
+    time = dt * np.arange(1, rollouts[0].tilt.shape[1] + 1)
+    figure, axis = plt.subplots(figsize=(ANIMATION_SIZE[0] / 50, 1.7), dpi=100)
+    lines = [
+        axis.plot([], [], color=color, linewidth=2, label=name)[0]
+        for name, color in zip(names, (RED, BLUE), strict=True)
+    ]
+    axis.set(xlim=(0, ANIMATION_S), ylim=(0, 6.5), xlabel="time [s]", ylabel="body tilt [deg]")
+    axis.axhline(scene.task.fail_tilt, color=GREY, linestyle=":")
+    axis.text(0.1, scene.task.fail_tilt - 0.15, "a fall", color=GREY, va="top")
+    axis.legend(frameon=False, loc="center", ncols=2)
+    figure.tight_layout()
+    frames, stride = [], round(1 / (ANIMATION_FPS * dt))
+    with contextlib.closing(Painter(scene, ANIMATION_SIZE)) as painter:
+        for step in range(0, len(time), stride):
+            bodies = [
+                labelled(painter.draw(rollout.qpos[0, step]), name, rollout.fell_at[0] <= step)
+                for name, rollout in zip(names, rollouts, strict=True)
+            ]
+            for line, rollout in zip(lines, rollouts, strict=True):
+                line.set_data(time[:step], rollout.tilt[0, :step])
+            figure.canvas.draw()
+            plot = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+            frames.append(Image.fromarray(np.vstack((np.hstack(bodies), plot))))
+    first, *others = frames
+    first.save(
+        HERE / "balance.webp",
+        save_all=True,
+        append_images=others,
+        duration=1000 // ANIMATION_FPS,
+        loop=0,
+        quality=60,
+        method=6,
+    )
+
+
+def labelled(picture: np.ndarray, name: str, fallen: bool) -> np.ndarray:
+    """The picture with a robot's name on it; a robot that has fallen is not simulated any more."""
+    image = Image.fromarray(picture)
+    words, font = f"{name}: fallen" if fallen else name, ImageFont.load_default(18)
+    ImageDraw.Draw(image).text((12, 10), words, RED if fallen else "#10202c", font)
+    return np.asarray(image)
+
+
 def main() -> None:
-    """Draws both."""
+    """Draws the named pictures, or all."""
+    names = sys.argv[1:] or ["decision", "radial", "balance"]
     with matplotlib.rc_context(STYLE):
+        if "balance" in names:
+            balance()
         for draw in (decision, radial):
-            figure = draw()
-            figure.tight_layout()
-            (HERE / f"{draw.__name__}.svg").write_bytes(figures.svg(figure))
+            if draw.__name__ in names:
+                figure = draw()
+                figure.tight_layout()
+                (HERE / f"{draw.__name__}.svg").write_bytes(figures.svg(figure))
 
 
 if __name__ == "__main__":
