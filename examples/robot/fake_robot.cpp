@@ -19,7 +19,7 @@ const char USAGE[] =
     "--lockstep    no real time: it waits for the command that answers each sample\n"
     "--everywhere  listen at all addresses of this machine, not only at the loopback\n";
 
-constexpr std::uint32_t WATCHDOG = 12;  // samples without a command, 48 ms, after which it damps
+constexpr std::uint32_t WATCHDOG = 12;  // samples, 48 ms: if the last answered one is older, it damps
 constexpr double SILENCE = 20.0;        // s after which a robot in lockstep gives up
 
 class Server {
@@ -66,6 +66,7 @@ public:
     // What the servos do now: the command, or damping.
     Targets targets()
     {
+        // Also if commands come, but answer states of long ago, or of the future.
         if (sequence_ - answered_ > WATCHDOG) {
             damped_ = true;
         }
@@ -99,8 +100,7 @@ private:
             controller_ = from;
             greeted_ = true;
             last_ = newer(header.sequence, last_) ? header.sequence : last_;
-        } else if (!greeted_ || !newer(header.sequence, last_) ||
-                   sequence_ - header.answers > WATCHDOG) {
+        } else if (!greeted_ || !newer(header.sequence, last_)) {
             ++old_;
         } else {
             ++taken_;
