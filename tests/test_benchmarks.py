@@ -49,6 +49,7 @@ SMALLEST = {
     "suites.py best --suites bias --scenarios 1": "| bias |",
     "replay.py --rounds 1": "| 136 | 1024 | full |",
     "runtime.py --calls 1000": "| ordinary |",
+    "exports.py --calls 10000": "| ONNX |",
     "soak.py --minutes 0.2 --samples 20000": "| `Controller`, 20,000 samples |",
 }
 """Command -> what its table says."""

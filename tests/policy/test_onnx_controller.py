@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from fixtures.policies import LAYOUTS, random_policy, with_head
+from fixtures.policies import LAYOUTS, random_policy, rewrite, with_head
 from fixtures.streams import evaluation_samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -100,6 +100,19 @@ def test_any_layout_does_what_the_runtime_does(layout: str, tmp_path: Path, conf
     head, changes = LAYOUTS[layout]
     random_policy(tmp_path / "p", with_head(config, head, body_height=0.33, **changes))
     assert stand(Pair(tmp_path / "p"), 12) > 4
+
+
+def test_legs_stay_within_their_reach(tmp_path: Path, config: Config) -> None:
+    """A policy that always raises the left front and lowers the right hind, a decision a sample."""
+    head, changes = LAYOUTS["every sample"]
+    path = tmp_path / "p"
+    random_policy(path, with_head(config, head, body_height=0.33, **changes))
+    rewrite(path, lambda w, m: w["head/bias"].fill(50))
+    pair = Pair(path)
+    stand(pair, 60)
+    heights = pair.python.model.legs.foot_heights(pair.python.targets)
+    most = pair.python.model.legs.height_range[1]
+    assert heights.max() == pytest.approx(most, abs=1e-9)
 
 
 @pytest.mark.slow
