@@ -569,3 +569,22 @@ def test_snippets_are_found() -> None:
     with pytest.raises(AssertionError, match="line 2 does not end"):
         snippets("```sh\nmake train\n")
     assert sum(len(snippets(page.read_text())) for page in PAGES) > 40
+
+
+@pytest.mark.parametrize(
+    ("sign", "most"),
+    [
+        ("mjx_balance.train(", 3),
+        (".replace(reward_toward", 1),
+        ("ICE = Suite(", 10),
+        ("nn.Module", 20),
+    ],
+)
+def test_python_takes_few_lines(sign: str, most: int) -> None:
+    """Training, a reward, a suite, a network: the first block of each, without blank lines."""
+    blocks = [x.text for x in snippets((DOCS / "python.md").read_text()) if x.kind == "python"]
+    lines = next(block for block in blocks if sign in block).splitlines()
+    if most == 1:
+        assert lines[0].endswith(".replace(reward_toward=0.5)")
+    else:
+        assert len([line for line in lines if line.strip()]) <= most

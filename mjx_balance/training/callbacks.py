@@ -56,7 +56,13 @@ class Callbacks(Callback):
     """All callbacks of a run as one; a function stands for its `on_log`."""
 
     def __init__(self, callbacks: Iterable[Callback | LogFunction] = ()):
-        """Takes callbacks, and functions of a line's metrics."""
+        """Takes callbacks, and functions of a line's metrics.
+
+        Raises:
+          ConfigError: for anything else.
+        """
+        if not isinstance(callbacks, Iterable):
+            raise ConfigError(f"callbacks is {quote(callbacks)}; it must be a list of them")
         self._all = [x if isinstance(x, Callback) else _Logger(x) for x in callbacks]
 
     def on_start(self, config: Config, folder: Path) -> None:

@@ -719,3 +719,5 @@ def test_all_callbacks_are_closed_though_one_fails() -> None:
     assert closed == [0, 1, 2]
     with pytest.raises(ConfigError, match="callbacks has 3; each must be a Callback, or a func"):
         Callbacks([3])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ConfigError, match="it must be a list of them"):
+        Callbacks(Listener())  # pyright: ignore[reportArgumentType]
