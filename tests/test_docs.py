@@ -43,7 +43,7 @@ from mjx_balance.report import page as report_page
 from mjx_balance.robots.catalogue import find_robot, shipped
 from mjx_balance.robots.schema import LegFile, RobotFile, parse_robot_file
 from mjx_balance.sim.engines.table import make_engine
-from mjx_balance.training import processes, run
+from mjx_balance.training import processes, run, tracking
 
 REPO = Path(__file__).resolve().parent.parent
 DOCS = REPO / "docs"
@@ -283,10 +283,11 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         (evaluation, "policy_scene", scene_of),
         (render, "write", lambda path, *_, **how: path.write_bytes(b"")),
         (render, "Window", mock.MagicMock(return_value=shut)),
-        (run, "train", lambda wanted, *_: config.check(wanted)),
+        (run, "train", lambda wanted, *_, **how: config.check(wanted)),
         (ppo, "train", train_ppo),
         (train_command, "read_run_config", lambda path: config.preset("default")),
         (processes, "find_cluster", lambda *_: first),
+        (tracking, "Tracker", lambda *_: None),
         (report_page, "write_report", lambda *_: []),
         # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
         # Compiled at once instead of operation by operation, which takes five times as long.
