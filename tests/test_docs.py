@@ -46,7 +46,7 @@ from mjx_balance.report import page as report_page
 from mjx_balance.robots.catalogue import find_robot, shipped
 from mjx_balance.robots.schema import LegFile, RobotFile, parse_robot_file
 from mjx_balance.sim.engines.table import make_engine
-from mjx_balance.training import processes, run
+from mjx_balance.training import processes, run, tracking
 from mjx_balance.training.callbacks import Callbacks
 from mjx_balance.training.finish import Finished
 from mjx_balance.training.sizing import make_learner
@@ -370,6 +370,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         (ppo, "train", train_ppo),
         (train_command, "read_run_config", lambda path: config.preset("default")),
         (processes, "find_cluster", lambda *_: first),
+        (tracking, "Tracker", lambda *_: None),
         (report_page, "write_report", lambda *_: []),
         # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
         # Compiled at once instead of operation by operation, which takes five times as long.

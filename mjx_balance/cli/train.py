@@ -91,6 +91,7 @@ def _train(args: TrainArgs) -> int:
     from mjx_balance.training import run, sizing
     from mjx_balance.training.checkpoints import SaveError
     from mjx_balance.training.processes import find_cluster
+    from mjx_balance.training.tracking import Tracker
 
     display = Display()
     try:
@@ -100,7 +101,9 @@ def _train(args: TrainArgs) -> int:
             cluster = find_cluster(*where)
             if cluster.process_id:
                 display = Display(Console(quiet=True))
-        run.train(args.config, args.run_dir, args.resume, display, cluster, args.profile)
+        trackers = [Tracker(args.track, display.say)] if args.track else []
+        folders = (args.run_dir, args.resume)
+        run.train(args.config, *folders, display, cluster, args.profile, callbacks=trackers)
     except (PolicyError, SaveError) as error:
         return complain(str(error), FAILED)
     except JaxRuntimeError as error:

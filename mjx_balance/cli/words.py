@@ -9,7 +9,7 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from mjx_balance.config import PRESETS, SWEEPABLE, Config, flatten, preset, to_dict
 from mjx_balance.errors import PATH, USAGE_ERROR, InputError, quote, shorten, suggest
@@ -64,6 +64,8 @@ class RunArgs:
     """Folder to create for the run; none: runs/PRESET-SEED-TIME."""
     resume: Path | None = None
     """Run folder to continue, instead of a new one; its config sets all defaults."""
+    track: Literal["wandb", "trackio"] | None = None
+    """Send the metrics to Weights & Biases or to Trackio; none: to TensorBoard's files alone."""
     profile: bool = False
     """Trace a call of the training program and print the share of time that each part takes."""
     distributed: bool = False

@@ -121,7 +121,7 @@ def test_flags_start_from_the_preset_or_from_the_resumed_run(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     given: list[Any] = []
-    monkeypatch.setattr(run, "train", lambda *arguments: given.append(arguments))
+    monkeypatch.setattr(run, "train", lambda *arguments, **_: given.append(arguments))
     assert main(["train", "--preset", "smoke", "--gamma", "0.7", "--run-dir", "a"]) == 0
     config, run_dir, resume, display, *others = given[0]
     assert (display.console.quiet, others) == (False, [None, False])
@@ -139,7 +139,7 @@ def test_a_process_among_several_is_quiet_but_for_the_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     given: list[Any] = []
-    monkeypatch.setattr(run, "train", lambda *arguments: given.append(arguments[3:]))
+    monkeypatch.setattr(run, "train", lambda *arguments, **_: given.append(arguments[3:]))
     where = "--coordinator localhost:7 --num-processes 3 --process-id"
     for index in (0, 2):
         assert main(["train", "--profile", *where.split(), str(index)]) == 0
