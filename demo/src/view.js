@@ -164,7 +164,7 @@ function drawGeom(mujoco, model, k) {
   const deck = DECK.test(name);
   const look = new THREE.MeshStandardMaterial({
     color: deck ? 0xffffff : new THREE.Color().setRGB(rgba[0], rgba[1], rgba[2], THREE.SRGBColorSpace),
-    roughness: deck ? 0.8 : 0.5,
+    roughness: material < 0 ? 0.6 : 1 - 0.8 * model.mat_specular[material],
     metalness: 0.05,
     map: deck ? planks(x / y) : null,
     opacity: rgba[3],

@@ -131,6 +131,20 @@ def test_it_runs_any_layout(layout: str, tmp_path: Path, config: Config) -> None
     assert len(np.unique(answers[:, 1])) > 4
 
 
+def test_a_point_between_two_levels_takes_the_even_one(tmp_path: Path, config: Config) -> None:
+    """Best points -0.75 and 0.25 of 5 levels are 0.5 and 2.5: levels 0 and 2, as NumPy rounds."""
+    path = tmp_path / "p"
+    random_policy(path, with_head(config, "radial", action_levels=5))
+
+    def aim(weights: Any, _: Any) -> None:
+        weights["head/kernel"].fill(0)
+        weights["head/bias"][:] = 0, -0.75, 0.25
+
+    rewrite(path, aim)
+    answers = compare(path, still(path, 2))
+    assert answers[0, 1] == 2
+
+
 def broken(fault: str, samples: np.ndarray) -> np.ndarray:
     """Samples to which something happens after a while."""
     at, joints = 170, samples.shape[1] - 6
