@@ -1,5 +1,6 @@
 """Progress of a run: a live panel in a terminal, plain lines elsewhere."""
 
+import dataclasses
 import itertools
 import math
 import os
@@ -11,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any, TextIO, cast
 
 from rich import progress as bars
-from rich.console import Console, Group
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
 from rich.markup import escape
 from rich.panel import Panel
@@ -47,6 +48,25 @@ MARGIN = 4  #: columns that live lines leave free: the terminal's ^C would break
 def part(bar: Callable[[float], None], number: int, count: int) -> Callable[[float], None]:
     """Progress of part `number`, from 0, of `count` equal ones of a stage."""
     return lambda share: bar((number + share) / count)
+
+
+@dataclasses.dataclass
+class _Narrow:
+    """What is drawn in all columns but the last `MARGIN`."""
+
+    inside: RenderableType
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        width = max(options.max_width - MARGIN, MARGIN)
+        yield from console.render(self.inside, options.update(width=width))
+
+
+class _Line(bars.Progress):
+    """A line that leaves `MARGIN` columns free, without even spaces there."""
+
+    def get_renderable(self) -> RenderableType:
+        """Returns the line, narrower than the console."""
+        return _Narrow(super().get_renderable())
 
 
 class _Output:
@@ -127,9 +147,8 @@ class Display:
         column = Column(no_wrap=True, overflow="crop", max_width=48)
         title = bars.TextColumn("{task.description}", table_column=column)
         spinner, bar = bars.SpinnerColumn(self._spinner), bars.BarColumn(bar_width=None)
-        free = bars.TextColumn("", table_column=Column(width=MARGIN))
-        columns = (spinner, title, bar, bars.TimeRemainingColumn(), "left", free)
-        return bars.Progress(*columns, console=self.console, transient=True, expand=True)
+        columns = (spinner, title, bar, bars.TimeRemainingColumn(), "left")
+        return _Line(*columns, console=self.console, transient=True, expand=True)
 
     def _plain_bar(self, name: str, began: float) -> Callable[[float], None]:
         """Says at intervals how far it is."""
