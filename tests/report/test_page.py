@@ -303,7 +303,8 @@ def test_the_first_run_that_has_a_policy_is_shown(
     assert asked == [(run / "report.json", 7, stage)]
     assert totals == [5], "two suites, the envelope, figures, video"
     assert "no video: no screen" in missing
-    assert page.write_report([run], out, 7, lambda n: totals.append(n) or stage, None, False) == []
+    bare, counted = tmp_path / "bare.html", lambda n: totals.append(n) or stage
+    assert page.write_report([run], bare, 7, counted, None, False) == []
     assert totals[1] == 4, "nobody has asked for a video, and none is missing"
     assert f"{half / 'policy.safetensors'} is missing" in missing
     text = out.read_text()
@@ -561,8 +562,8 @@ def test_no_page_is_wider_than_a_phone(browser: str, written: Path, tmp_path: Pa
             f'srcdoc="{html.escape(text)}"></iframe>'
         )
         profile = f"--user-data-dir={tmp_path / 'profile'}"
-        flags = ("--headless", "--no-sandbox", "--disable-gpu", profile, "--dump-dom")
-        command = [browser, *flags, frame.as_uri()]
+        flags = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--dump-dom")
+        command = [browser, *flags, profile, frame.as_uri()]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
         assert re.findall("<title>(.*?)</title>", done.stdout)[0] == width
 
