@@ -289,16 +289,16 @@ def test_envs_that_nobody_asked_for_are_halved_until_they_fit(
         if learner.spec.num_envs > 300:
             raise ConfigError("too much")
 
-    with_spec = lambda config, env: types.SimpleNamespace(spec=config)  # noqa: E731
+    with_spec = lambda config, *_: types.SimpleNamespace(spec=config)  # noqa: E731
     monkeypatch.setattr(sizing, "make_learner", with_spec)
     monkeypatch.setattr(sizing, "check_memory", check)
-    sized, *_ = run._set_up(CONFIG)
+    sized, *_ = run._set_up(CONFIG, None, None)
     assert (sized.num_envs, sized.num_env_steps, sized.dqn.batch_size) == (256, 40_000, 256)
     with pytest.raises(ConfigError, match="too much"):
-        run._set_up(dataclasses.replace(CONFIG, num_envs=512))
+        run._set_up(dataclasses.replace(CONFIG, num_envs=512), None, None)
     monkeypatch.setattr(sizing, "CPU_ENVS", 512)
     with pytest.raises(ConfigError, match="too much"):
-        run._set_up(CONFIG)
+        run._set_up(CONFIG, None, None)
 
 
 def test_errors_of_a_running_program_are_explained_where_they_can_be() -> None:
