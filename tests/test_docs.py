@@ -370,7 +370,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         (ppo, "train", train_ppo),
         (train_command, "read_run_config", lambda path: config.preset("default")),
         (processes, "find_cluster", lambda *_: first),
-        (tracking, "Tracker", lambda *_: None),
+        (tracking, "Tracker", lambda *_: lambda metrics: None),
         (report_page, "write_report", lambda *_: []),
         # MJX compiles for half a minute; the env is the same over MuJoCo's C engine.
         # Compiled at once instead of operation by operation, which takes five times as long.
