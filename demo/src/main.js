@@ -217,6 +217,8 @@ class Page {
     this.tiltPlot.clear();
     this.boardPlot.clear();
     this.due = 0;
+    this.speed = 1;
+    this.before = performance.now(); // loading is no slow motion
     this.pull = [0, 0];
     this.showPull();
     element("off", HTMLButtonElement).setAttribute("aria-pressed", "false");

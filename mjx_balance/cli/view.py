@@ -57,7 +57,7 @@ def view(argv: list[str]) -> int:
         window = render.Window(session.scene, session.press)
     except render.RenderError as error:
         return complain(
-            f"{error}; `mjx-balance evaluate --video` and `view --browser` need no display"
+            f"{error}; `mjx-balance view --browser` and `evaluate --video` need no display"
         )
     above, below = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
     keys = "Enter: push" if args.suite else KEYS
