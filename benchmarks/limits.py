@@ -21,7 +21,7 @@ import numpy as np
 from common import DURATION, POLICY, Row
 
 from mjx_balance.config import TaskConfig, preset
-from mjx_balance.config.sea import RATE
+from mjx_balance.config.sea import bounds
 from mjx_balance.evaluation.controllers import AttitudePD, Controller, ImuPD, make_controller
 from mjx_balance.evaluation.rollout import observing, policy_scene, roll_out, run_suite, summarize
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS, SUITES, draw_suite
@@ -137,7 +137,7 @@ def decks(args: argparse.Namespace) -> None:
             task = dataclasses.replace(
                 scene.task,
                 max_incline=max(angle, scene.task.max_incline),
-                board_rate=max(RATE * angle / period, scene.task.board_rate) + 1e-6,
+                board_rate=max(bounds()[0] * angle / period, scene.task.board_rate) + 1e-6,
                 sea_angle=angle,
                 sea_period=period,
                 sea_height=height,

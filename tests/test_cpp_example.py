@@ -363,10 +363,10 @@ def test_a_command_answers_each_state_as_the_runtime_would(
         range(answers[0].sequence, answers[0].sequence + 150)
     )
     expected = Controller(BEST, gains=True)
-    assert (answers[0].gains[0] == expected._gains[0].ravel()).all()
-    assert (answers[0].gains[1] == expected._gains[1].ravel()).all()
+    assert (answers[0].gains[0] == expected.model.gains[0].ravel()).all()
+    assert (answers[0].gains[1] == expected.model.gains[1].ravel()).all()
     np.testing.assert_allclose(
-        answers[0].gains[2], (expected._gains[0] * expected._trim).ravel(), rtol=1e-6
+        answers[0].gains[2], (expected.model.gains[0] * expected.model.trim).ravel(), rtol=1e-6
     )
     assert robot.end() == (
         0,
@@ -527,9 +527,9 @@ class Driver:
         self.socket.settimeout(20.0)
         self.sequence, self.last = 0, 0
         expected = Controller(BEST, gains=True)
-        assert expected._gains is not None
-        torque = expected._gains[0] * expected._trim
-        self.standing = np.concatenate((expected.targets, *expected._gains, torque))
+        assert expected.model.gains is not None
+        torque = expected.model.gains[0] * expected.model.trim
+        self.standing = np.concatenate((expected.targets, *expected.model.gains, torque))
 
     def hello(self) -> Packet:
         """Says hello; returns the first state."""
@@ -753,8 +753,8 @@ def test_the_gains_of_the_policy_are_those_of_the_scene() -> None:
     model, servos = scene.model, scene.leg_ctrl
     assert (controller.stiffness == model.actuator_gainprm[servos, 0]).all()
     assert (controller.damping == model.dof_damping[scene.leg_qpos - 1]).all()
-    assert controller._trim is not None
-    np.testing.assert_allclose(controller._trim, scene.stance.leg_trim, rtol=0, atol=1e-7)
+    assert controller.model.trim is not None
+    np.testing.assert_allclose(controller.model.trim, scene.stance.leg_trim, rtol=0, atol=1e-7)
 
 
 SDK = r"""

@@ -12,7 +12,7 @@ from mjx_balance.cli.common import complain
 from mjx_balance.errors import PATH, how_to_install, shorten
 from mjx_balance.evaluation.rollout import policy_scene
 from mjx_balance.policy.c_header import export_header
-from mjx_balance.policy.file import convert_policy, find_policy, read_policy
+from mjx_balance.policy.file import convert_policy, find_policy, read_policy, upgrade_policy
 from mjx_balance.policy.manifest import FORMAT_VERSION, naming, upgrade
 from mjx_balance.policy.network import Policy
 
@@ -56,23 +56,23 @@ def _write_onnx(args: ExportArgs) -> int:
         from mjx_balance.policy.onnx_controller import export_controller
     except ImportError as error:
         return complain(f"export needs the package onnx ({error}); {how_to_install('onnx')}")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "policy"
-        policy = _convert(args, path)
-        if args.stateful:
+    if args.stateful:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "policy"
+            legs = len(_convert(args, path).manifest["robot"]["legs"])
             size, values = export_controller(path, args.out)
-            legs = len(policy.manifest["robot"]["legs"])
-            about = (
-                f"joint_positions ({legs}, 3), gyro (3,), accelerometer (3,), state ({values},) "
-                f"float64 -> targets ({legs}, 3), command (2,) float64, decided () bool, "
-                f"next_state ({values},) float64"
-            )
-        else:
-            size = export_onnx(policy, args.out)
-            about = (
-                f"observation (N, {policy.observation_size}) float32 -> q_values "
-                f"(N, {len(policy.actions)}) float32, action (N,) int64, command (N, 2) float32"
-            )
+        about = (
+            f"joint_positions ({legs}, 3), gyro (3,), accelerometer (3,), state ({values},) "
+            f"float64 -> targets ({legs}, 3), command (2,) float64, decided () bool, "
+            f"next_state ({values},) float64"
+        )
+    else:
+        policy = Policy(*upgrade_policy(*_source(args)))
+        size = export_onnx(policy, args.out)
+        about = (
+            f"observation (N, {policy.observation_size}) float32 -> q_values "
+            f"(N, {len(policy.actions)}) float32, action (N,) int64, command (N, 2) float32"
+        )
     print(f"{shorten(args.out, PATH)}: {size / 1000:,.1f} kB, opset {OPSET}")
     print(about)
     return 0
@@ -95,8 +95,14 @@ def _write_header(args: ExportArgs) -> int:
 
 
 def _convert(args: ExportArgs, out: Path) -> Policy:
+    path, action, leg_trim = _source(args)
+    return convert_policy(path, out, action, leg_trim)
+
+
+def _source(args: ExportArgs) -> tuple[Path, str | None, np.ndarray | None]:
+    """The policy's file, and what changes."""
     path = find_policy(args.policy)
-    return convert_policy(path, out, args.action, _leg_trim(path) if args.trim else None)
+    return path, args.action, _leg_trim(path) if args.trim else None
 
 
 def _leg_trim(path: Path) -> np.ndarray:

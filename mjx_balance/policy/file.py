@@ -65,14 +65,21 @@ def convert_policy(
       PolicyError: if `path` is not a policy of these formats, or its head allows no such action.
       OSError: if `out` cannot be written; an old file then stays.
     """
+    manifest, weights = upgrade_policy(path, action, leg_trim)
+    return save_policy(out, weights, manifest)
+
+
+def upgrade_policy(
+    path: Path, action: str | None = None, leg_trim: np.ndarray | None = None
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Manifest and weights that `convert_policy` writes; raises as it does, but for `OSError`."""
     manifest, weights = read_policy(path)
     with naming(path):
-        manifest = upgrade(manifest)
-        if action is not None:
-            manifest = Policy(manifest, weights).with_action(action).manifest
-        if leg_trim is not None:
-            manifest = manifest | {"leg_trim_rad": leg_trim.tolist()}
-        return save_policy(out, weights, manifest)
+        policy = Policy(upgrade(manifest), weights)
+        manifest = (policy if action is None else policy.with_action(action)).manifest
+    if leg_trim is not None:
+        manifest = manifest | {"leg_trim_rad": leg_trim.tolist()}
+    return manifest, weights
 
 
 def shipped_policies() -> dict[str, Path]:

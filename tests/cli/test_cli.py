@@ -527,7 +527,7 @@ def test_a_folders_name_reaches_the_terminal_as_text(capsys: pytest.CaptureFixtu
     Display(Console()).say(f"{folder}: preset default")
     said = capsys.readouterr()
     assert_safe(said.out + said.err)
-    assert said.out.count("runs?[2J") == 7
+    assert said.out.count("runs?[2J") == 3
 
 
 class StubWindow:

@@ -70,6 +70,8 @@ def test_noise_stops_at_the_ends() -> None:
 class Favourite:
     """A network of 9 actions that likes action 5 best."""
 
+    head = None  #: there is one, which `apply` calls
+
     def apply(self, params: Any, obs: jax.Array, method: str) -> Additive:
         return Additive(jax.nn.one_hot(5, 9), (9,))
 

@@ -53,6 +53,8 @@ def test_no_point_of_the_square_is_better_than_the_best(mu: tuple[float, float])
 class Aims:
     """A network whose best point is (0.3, -0.98), whatever it sees."""
 
+    head = None  #: there is one, which `apply` calls
+
     def apply(self, params: Any, obs: jax.Array, method: str) -> Radial:
         out = jnp.asarray((0.0, 0.3, -0.98))
         return Radial(out, jnp.zeros(4), jnp.zeros(2), FACTORS)

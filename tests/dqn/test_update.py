@@ -25,6 +25,8 @@ ERRORS = [(False, 0.0, 0.5 + 0.1 * 4 - 2), (True, 0.0, 0.5 + 0.1 * -1 - 2), (Fal
 class Table:
     """A network whose parameters are the action values of every state, an integer."""
 
+    head = None  #: there is one, which `apply` calls
+
     def apply(self, params: jax.Array, obs: jax.Array, method: str) -> Additive:
         assert method == "head"
         values = params[obs[..., 0].astype(int)]
