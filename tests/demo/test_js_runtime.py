@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fixtures.javascript import STATES, evaluate_script, replay
-from fixtures.policies import random_policy, rewrite, with_head
+from fixtures.policies import LAYOUTS, random_policy, rewrite, with_head
 
 from mjx_balance import runtime
 from mjx_balance.config import Config
@@ -93,17 +93,6 @@ def test_it_decides_as_the_runtime_with_every_policy(name: str, scenarios: int) 
     for suite in ("corner", "push", "noise"):
         done += decisions(compare(SHIPPED[name], evaluation_samples(name, suite, scenarios, 60.0)))
     assert done >= 890 * scenarios
-
-
-LAYOUTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "joint": ("joint", {"action_levels": 5}),
-    "factored": ("factored", {"command_lags": (0, 3), "action_ramp": 1.0}),
-    "radial": ("radial", {"gyro_lags": (0, 120), "accel_lags": (7, 3), "imu_mean": 4}),
-    "rates": ("radial", {"ctrl_dt": 0.05, "sim_dt": 0.005, "action_ramp": 0.01, "imu_mean": 2}),
-    "long memory": ("radial", {"mean_times": (0.5, 30.0), "filter_times": (4.0, 0.3)}),
-    "off the grid": ("radial", {"action": "continuous", "command_lags": (0, 1)}),
-    "every sample": ("radial", {"ctrl_dt": 0.004, "action_ramp": 0.5}),
-}
 
 
 def still(path: Path, count: int, seed: int = 1, swing: float = 0.0) -> np.ndarray:
