@@ -436,7 +436,10 @@ def test_pipes_and_sockets_are_refused_at_once(folder: RunFolder) -> None:
         read_run_config(folder.path)
 
 
-def test_a_place_that_cannot_be_looked_at_is_a_sentence(folder: RunFolder) -> None:
+def test_a_place_that_cannot_be_looked_at_is_a_sentence(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder.path)  # and back to where the other tests are, at the end
     deep = folder.checkpoints
     for _ in range(40):
         deep.mkdir()
