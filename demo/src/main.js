@@ -37,7 +37,7 @@ const SUITES = {
   encoder: "As paper, with joint encoders that are off.",
   delay: "As paper, with samples and commands that come late.",
   dropout: "As paper; every tenth IMU sample is lost.",
-  load: "As paper; a load is laid on in the middle.",
+  shift: "As paper; a load is laid on in the middle.",
   slip: "As paper; a foot gets onto a slippery patch.",
   weak: "As paper; a servo weakens.",
 };

@@ -24,7 +24,7 @@ class EvaluateArgs(ControllerArgs):
 
     suite: str = "paper"
     """Kind of scenarios: paper, corner, noise, payload, friction, gains, soft, latency, push, fast,
-    steep, recover, steps, sea, platform, bias, encoder, delay, dropout, load, slip or
+    steep, recover, steps, sea, platform, bias, encoder, delay, dropout, shift, slip or
     weak; or module:NAME of your own."""
     scenarios: int = 256
     """Number of scenarios."""

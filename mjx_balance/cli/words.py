@@ -47,7 +47,7 @@ COMMANDS = {
 SUITES = (
     *("paper", "corner", "noise", "payload", "friction", "gains", "soft", "latency", "push"),
     *("fast", "steep", "recover", "steps", "sea", "platform", "bias", "encoder", "delay"),
-    *("dropout", "load", "slip", "weak"),
+    *("dropout", "shift", "slip", "weak"),
 )
 """Names of `evaluation.suites.SUITES`, which imports MuJoCo."""
 CONTROLLERS = ("none", "pd-imu", "pd-attitude", "rate-oracle", "clairvoyant")

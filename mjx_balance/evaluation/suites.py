@@ -84,7 +84,7 @@ SUITES: dict[str, Suite] = {
     ),
     "dropout": Suite(RandomizationConfig(dropout=0.1)),  # every tenth IMU sample is lost
     # From a fifth to three fifths of the scenario on:
-    "load": Suite(RandomizationConfig(event_payload=5.0)),  # as `payload`, laid on
+    "shift": Suite(RandomizationConfig(event_payload=5.0)),  # as `payload`, laid on
     "slip": Suite(RandomizationConfig(event_grip=0.1)),  # one foot keeps 10 to 100% of its friction
     "weak": Suite(RandomizationConfig(event_strength=0.2)),  # one servo 20 to 100% of its stiffness
 }

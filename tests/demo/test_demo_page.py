@@ -101,7 +101,7 @@ def evaluate_there(browser: Browser, address: str, query: str) -> dict[str, Any]
 
 
 @pytest.mark.parametrize(
-    ("policy", "suite"), [("best", "corner"), ("real", "push"), ("real", "load")]
+    ("policy", "suite"), [("best", "corner"), ("real", "push"), ("real", "shift")]
 )
 def test_it_balances_as_in_pythons_evaluation(
     browser: Browser, address: str, policy: str, suite: str

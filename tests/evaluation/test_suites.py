@@ -257,7 +257,7 @@ def test_impossible_wishes_are_refused(config: Config) -> None:
         draw(config, "paper", 1, 10, -1)
     names = (
         "paper, corner, noise, payload, friction, gains, soft, latency, push, fast, steep, "
-        "recover, steps, sea, platform, bias, encoder, delay, dropout, load, slip, weak"
+        "recover, steps, sea, platform, bias, encoder, delay, dropout, shift, slip, weak"
     )
     with pytest.raises(SuiteError, match=f"unknown suite 'moon'; known suites: {names}"):
         draw(config, "moon", 1, 10, 0)
