@@ -54,6 +54,7 @@ LINKS = {
     "docs/clusters.md": "clusters.md",
     "docs/install.md": "install.md",
     "docs/python.md": "python.md",
+    "docs/versions.md": "versions.md",
     "../docs/clusters.md": "clusters.md",
     "../docs/other_algorithms.md": "other_algorithms.md",
     "../docs/results.md": "results.md",

@@ -4,12 +4,15 @@ import dataclasses
 import importlib.metadata
 import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 import mjx_balance
 from mjx_balance import Callback, Suite, api
@@ -27,6 +30,15 @@ from mjx_balance.training.finish import Finished
 from mjx_balance.training.processes import Interrupted
 
 RESULTS = {"paper": {"tilt_deg": {"mean": 0.05}, "falls": 1, "scenarios": 4}}
+
+
+def test_one_version_stands_everywhere() -> None:
+    repo = Path(__file__).parents[1]
+    version = tomllib.loads((repo / "pyproject.toml").read_text())["project"]["version"]
+    newest = re.search(r"^## (.*)$", (repo / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest
+    assert newest[1] == version
+    assert yaml.safe_load((repo / "CITATION.cff").read_text())["version"] == version
 
 
 def test_everything_is_listed_and_there() -> None:
