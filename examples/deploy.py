@@ -4,6 +4,7 @@ python examples/deploy.py best
 """
 
 import argparse
+from collections import deque
 
 import mujoco
 import numpy as np
@@ -35,11 +36,14 @@ def main() -> None:
     data.sensordata[scene.imu] = stance.imu
     boards = draw_suite(scene.task, scene.robot, "corner", 1, SECONDS, seed=0).scenario
     controller = Controller(path, clock=lambda: data.time)
+    delay = round(scene.robot.command_delay / task.sim_dt)  # physics steps until the servos obey
+    commands: deque[np.ndarray] = deque(maxlen=1 + delay)
     tilts = []
     while data.time < SECONDS:
         gyro, accelerometer = np.split(data.sensordata[scene.imu], 2)
         targets = controller.step(data.qpos[scene.leg_qpos], gyro, accelerometer)
-        data.ctrl[scene.leg_ctrl] = targets + stance.leg_trim
+        commands.append(targets + stance.leg_trim)
+        data.ctrl[scene.leg_ctrl] = commands[0]
         board = board_angle(task, boards, np.array([data.time + task.sim_dt]))[0]
         data.ctrl[scene.board_ctrl] = np.radians(board)
         mujoco.mj_step(model, data)

@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import math
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -749,6 +750,22 @@ def test_the_example_balances_as_the_evaluation_does() -> None:
     expected = f"mean tilt {tilt.mean():.3f} deg, greatest {tilt.max():.3f} deg in 20 s\n"
     run = example("best")
     assert (run.returncode, run.stdout) == (0, expected), run.stderr
+
+
+def test_the_examples_servos_obey_as_late_as_the_robots(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spot's, after 4 ms. For 4 s: dry friction amplifies the last bits later."""
+    policy = load_policy("spot")
+    assert policy.robot.command_delay == 0.004
+    tilt = run_suite(policy_scene(policy), observing(policy), "corner", 1, 4.0, 0).tilt
+    main = runpy.run_path(str(REPO / "examples/deploy.py"))["main"]
+    monkeypatch.setitem(main.__globals__, "SECONDS", 4.0)
+    monkeypatch.setitem(main.__globals__, "__doc__", "Spot.")
+    monkeypatch.setattr(sys, "argv", ["deploy.py", "spot"])
+    main()
+    mean, greatest = map(float, re.findall(r"[\d.]+(?= deg)", capsys.readouterr().out))
+    assert (mean, greatest) == pytest.approx((tilt.mean(), tilt.max()), abs=6e-4)
 
 
 def test_the_example_says_what_it_needs() -> None:

@@ -9,6 +9,7 @@ For each, the tests that import the changed module run, the nearest first, until
 
 import argparse
 import difflib
+import functools
 import os
 import random
 import re
@@ -59,14 +60,20 @@ def mutable(mutation: Mutation) -> bool:
     return loose[0] != loose[1]
 
 
-def drawn(count: int, seed: int, seconds: float) -> list[Mutant]:
-    """Mutants of the whole package, each mutation as likely as any other."""
-    candidates: list[tuple[Path, libcst.Module, Mutation]] = []
+@functools.cache
+def candidates() -> list[tuple[Path, libcst.Module, Mutation]]:
+    """All mutations of the package; they take most of a minute."""
+    result: list[tuple[Path, libcst.Module, Mutation]] = []
     for file in sources():
         module, mutations, *_ = create_mutations(str(file), (REPO / file).read_text())
-        candidates += [(file, module, mutation) for mutation in mutations if mutable(mutation)]
+        result += [(file, module, mutation) for mutation in mutations if mutable(mutation)]
+    return result
+
+
+def drawn(count: int, seed: int, seconds: float) -> list[Mutant]:
+    """Mutants of the whole package, each mutation as likely as any other."""
     mutants = []
-    for file, module, mutation in random.Random(seed).sample(candidates, len(candidates)):
+    for file, module, mutation in random.Random(seed).sample(candidates(), len(candidates())):
         tree = module.deep_replace(mutation.original_node, mutation.mutated_node)
         assert isinstance(tree, libcst.Module)
         try:
