@@ -43,7 +43,7 @@ PAGE = Path(__file__).resolve().parents[1] / "page"
 """The built page: `demo/build.js` writes it."""
 TYPES = {".js": "text/javascript", ".wasm": "application/wasm"}
 BASELINES = ("pd-imu", "none")
-"""Those that the page knows."""
+"""Baselines that the page can run."""
 SCENARIOS, SECONDS = 8, 60.0
 """Of every suite; scenario k is the one of `mjx-balance evaluate --seed 0`."""
 
@@ -272,7 +272,7 @@ def _copy_license(data: Path, robot: str) -> None:
 
 
 def shipped_scenes() -> Iterable[tuple[Path, Scene]]:
-    """The shipped policies whose robots' models are here; names those that are not on stderr."""
+    """The shipped policies with their scenes; names policies without a robot's model on stderr."""
     for name, path in shipped_policies().items():
         try:
             yield path, policy_scene(load_policy(path))
@@ -300,7 +300,7 @@ def view_in_browser(args: ControllerArgs, suite: str | None, seed: int, port: in
     `port` 0 takes a free one.
 
     Raises:
-      InputError: if the page is not here, or policy, baseline, suite or port cannot be used.
+      InputError: if the page is not built, or policy, baseline, suite or port cannot be used.
     """
     page = page_folder()
     scene, _ = args.load()

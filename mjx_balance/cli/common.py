@@ -43,8 +43,7 @@ def check_out(name: str, path: Path | None, suffix: str = "") -> None:
 def find_named(flag: str, text: str) -> Any:
     """Imports what `module:NAME` names, from the current folder or an installed package.
 
-    Only a word of the command line comes here: what a policy or a run folder says is never
-    imported.
+    Call it only with words of the command line, never with a name from a policy or a run folder.
 
     Raises:
       InputError: if there is no such module or name, or the module fails.
@@ -98,7 +97,7 @@ def robot_of(text: str) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class ControllerArgs:
-    """The flags that say who balances."""
+    """The flags that choose a policy or a baseline."""
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
     """Policy file, run folder, or the name of a shipped policy."""
@@ -108,8 +107,8 @@ class ControllerArgs:
     """Robot of the baseline, or of a policy whose robot is not shipped: TOML file, menagerie:NAME,
     or module:NAME of your own."""
     action: Literal["grid", "continuous"] | None = None
-    """Command height changes of the grid, or any up to its greatest; none: as the policy was
-    trained, and any for a baseline."""
+    """Height changes to command: those of the grid, or any up to the greatest of them; none: as the
+    policy was trained, and any for a baseline."""
 
     def load(self) -> tuple[Scene, Controller]:
         """Loads the policy or builds the baseline, and its scene.

@@ -19,21 +19,22 @@ from mjx_balance.policy.network import Policy
 
 @dataclasses.dataclass(frozen=True)
 class ExportArgs:
-    """Write a policy as an ONNX model (extra onnx), as a controller in C, or in today's format."""
+    """Write a policy as ONNX (extra onnx), as a controller in C, or in the current format."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """Policy file, run folder, or the name of a shipped policy."""
     out: Path
     """File to write: NAME.onnx, NAME.h, or NAME.safetensors in the current format."""
     action: Literal["grid", "continuous"] | None = None
-    """Command height changes of the grid, or any up to its greatest; none: as the policy was
-    trained."""
+    """Height changes to command: those of the grid, or any up to the greatest of them; none: as the
+    policy was trained."""
     trim: bool = False
-    """Measure in simulation how far the servos must aim beyond their targets to bear the robot, so
-    that a runtime knows feed-forward torques; a trained policy has that already."""
+    """Add the feed-forward torques that bear the robot's weight: measure in simulation how far the
+    servos must aim beyond their targets. Newly trained policies have them already."""
     stateful: bool = False
-    """Write the controller as ONNX: from a sample of the sensors and its state to joint targets and
-    the next state. Without it an ONNX model is the network: from observations to commands."""
+    """Write the whole controller as ONNX: a sample of the sensors and a state go in, joint targets
+    and the next state come out. Without this flag, an ONNX model is the network alone, from
+    observations to commands."""
 
 
 def export(argv: list[str]) -> int:

@@ -93,7 +93,7 @@ def problems(scene: Scene, tilt_test: TiltTest) -> list[str]:
         )
     joint, share = _most_loaded(scene, tilt_test)
     if share >= NO_TORQUE_LEFT:
-        taken = f"{quote(joint)} takes {100 * share:.0f}% of its own"
+        taken = f"{quote(joint)} takes {100 * share:.0f}% of its limit"
         sentences.append(f"robot {name} has no torque left {place}: {taken}")
     return sentences
 
@@ -120,9 +120,9 @@ def describe(scene: Scene, tilt_test: TiltTest) -> list[str]:
         *map(_leg, robot.legs),
         *(f"note: {shorten(note, MESSAGE)}" for note in robot_notes(scene.robot_source)),
         "",
-        f"height changes up to {1000 * task.action_max:.2f} mm follow {able:.2f} deg/s, "
-        f"{able / task.board_rate:.2f} of the board's {task.board_rate:g}",
-        f"the legs follow {reach:.1f} deg on both axes at once; the board tilts to "
+        f"height changes up to {1000 * task.action_max:.2f} mm turn the trunk by {able:.2f} deg/s, "
+        f"{able / task.board_rate:.2f} times the board's {task.board_rate:g}",
+        f"the legs can level {reach:.1f} deg on both axes at once; the board tilts to "
         f"{task.max_incline:g}",
         _standing(scene, tilt_test),
         _stance(scene),
@@ -148,7 +148,7 @@ def _standing(scene: Scene, tilt_test: TiltTest) -> str:
     still = "stands still" if slow else f"slides by {1000 * tilt_test.creep:.0f} mm/s"
     loaded = f"the most loaded servo, {shorten(joint)}, takes {100 * share:.0f}% of its torque"
     if UNLIMITED in (scene.robot.hip_torque, scene.robot.knee_torque):
-        loaded = "its model limits no torque: say hip_torque and knee_torque, in N m"
+        loaded = "its model has no torque limits: set hip_torque and knee_torque, in N m"
     place = f"at {scene.task.max_incline:g} deg on both axes"
     return f"{place} it {still}, level to {tilt_test.tilt:.2f} deg; {loaded}"
 
@@ -187,8 +187,8 @@ def _implausible(scene: Scene) -> Iterator[str]:
         torque = getattr(robot, name)
         if torque > MAX_TORQUE * holds and torque != UNLIMITED:
             yield (
-                f"warning: {name} is {torque:g} N m, {torque / holds:.0f} times what holds the "
-                f"robot's weight at its leg's length; say {name}, in N m, in the file"
+                f"warning: {name} is {torque:g} N m, {torque / holds:.0f} times the robot's "
+                f"weight times its leg's length; set {name}, in N m, in the file"
             )
 
 

@@ -122,7 +122,7 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
         raise ValueError(f"{name} is larger than {MOST_ARRAY} bytes")
     stream = io.BytesIO(content)
     if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError(f"{name} has a format that no log has")
+        raise ValueError(f"{name} has another format than in a log")
     shape, by_column, dtype = np.lib.format.read_array_header_1_0(stream, MOST_HEADER)
     kind = OTHERS.get(name) or SHAPES[name][0]
     if (kind != dtype.kind and dtype.newbyteorder("=") != np.dtype(kind)) or by_column:
@@ -144,7 +144,7 @@ def _check(log: Log) -> None:
         if log[name].shape != expected:
             raise ValueError(f"{name} has another shape")
     if (log["state"] >= len(STATES)).any() or (log["fault"] >= len(Fault)).any():
-        raise ValueError("it has states or faults that there are not")
+        raise ValueError("it has unknown states or faults")
 
 
 def run_log(path: Path, log: Log) -> Replay:
@@ -198,7 +198,7 @@ def describe(log: Log, replayed: Replay) -> list[str]:
     time = _clock(log)
     lines = [
         f"{time[-1] - time[0]:.1f} s, {int(log['decision'].sum())} decisions; of {int(both.sum())} "
-        f"replayed, {equal} are the log's, and heights differ by at most "
+        f"replayed, {equal} equal the log's, and height changes differ by at most "
         f"{1000 * apart.max(initial=0.0):.3f} mm"
     ]
     fault = Fault(int(log["fault"][-1]))

@@ -17,16 +17,16 @@ class ReportArgs:
     """Write one HTML page about runs: tables, curves, envelope, video. Needs no JAX."""
 
     run_dirs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Run folders; the report compares the first with a policy to the baselines."""
+    """Run folders; the report compares the first policy among them with the baselines."""
     out: Path | None = None
     """File to write; none: report.html in the first folder."""
     scenarios: int = 8
     """Scenarios per suite and controller; 64 give figures to quote, in some minutes."""
     video: bool = True
-    """Draw a video, which takes longest without a GPU."""
+    """Draw a video; without a GPU, this takes longest."""
     robot: str | None = None
-    """Robot of the policy, as TOML file, menagerie:NAME or module:NAME; none: it must be a shipped
-    one."""
+    """Robot of the policy, if it is not a shipped one: TOML file, menagerie:NAME, or module:NAME of
+    your own."""
 
 
 def report(argv: list[str]) -> int:

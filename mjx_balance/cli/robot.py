@@ -43,7 +43,7 @@ def check(robot: Positional[str], picture: Path | None = None) -> int:
 
 
 def new(model: Positional[str], out: Path | None = None, strip: tuple[str, ...] = ()) -> int:
-    """Draft a robot's TOML file from its model, and say what has to be mended first.
+    """Draft a robot's TOML file from its model, and print what you have to complete.
 
     Args:
       model: MJCF or URDF file, PACKAGE:PATH of one in a Python package, or menagerie:NAME.

@@ -39,7 +39,7 @@ class ViewArgs(ControllerArgs):
     seed: int = 0
     """Seed of the suite's scenarios, and of the direction of pushes by key."""
     browser: bool = False
-    """Serve a page for a browser instead, at 127.0.0.1; no display is needed here."""
+    """Serve a page for a browser instead, at 127.0.0.1; this needs no display."""
     port: int = 0
     """Port of the page; 0: a free one."""
 

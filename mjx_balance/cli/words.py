@@ -35,14 +35,14 @@ COMMANDS = {
         "train:sweep", "train with several values of a number", "gamma=0.1,0.4 --num-seeds 4"
     ),
     "evaluate": Command(
-        "evaluate:evaluate", "tilt and falls of a policy in MuJoCo", "best --suite corner"
+        "evaluate:evaluate", "measure a policy in plain MuJoCo", "best --suite corner"
     ),
     "report": Command("report:report", "write an HTML page about runs", "runs/first"),
     "export": Command("export:export", "write a policy as ONNX or C", "best --out policy.h"),
     "replay": Command("replay:replay", "run a robot's log through a policy", "log.npz"),
-    "view": Command("view:view", "watch a policy, tilt the board by keys", "best"),
+    "view": Command("view:view", "watch a policy; keys tilt the board", "best"),
     "robot": Command("robot:robot", "draft or check your own robot's file", "check my_robot.toml"),
-    "completion": Command("words:completion", "complete words with TAB in a shell", "bash"),
+    "completion": Command("words:completion", "print a script for TAB completion", "bash"),
 }
 SUITES = (
     *("paper", "corner", "noise", "payload", "friction", "gains", "soft", "latency", "push"),
@@ -65,12 +65,13 @@ class RunArgs:
     resume: Path | None = None
     """Run folder to continue, instead of a new one; its config sets all defaults."""
     track: Literal["wandb", "trackio"] | None = None
-    """Send the metrics to Weights & Biases or to Trackio; none: to TensorBoard's files alone."""
+    """Send the metrics to Weights & Biases or to Trackio; none: only to TensorBoard's files."""
     profile: bool = False
     """Trace a call of the training program and print the share of time that each part takes."""
     distributed: bool = False
-    """Train with several processes, which Slurm, Open MPI or Kubernetes starts on one machine or
-    many. Without them, use the next three flags. Give all processes the same other flags."""
+    """Train with several processes that Slurm, Open MPI or Kubernetes starts, on one machine or
+    many; without one of these, use the next three flags instead. All other flags must be the same
+    for all processes."""
     coordinator: str | None = None
     """HOST:PORT at which process 0 listens; none: the cluster sets it."""
     process_id: int | None = None
@@ -94,9 +95,10 @@ Train a policy, export it, and evaluate it in plain MuJoCo.
                          module:NAME of your own (quadruped)
   --seed N               random seed (0)
   --num-seeds N          seeds to train at once; the best is exported (1)
-  --num-env-steps N      decisions of a run, over all envs (preset's)
+  --num-env-steps N      decisions of a run, over all envs (by preset)
   --num-envs N           envs simulated at once (sized to the device)
-  --export last|best     export the last policy, or that validated best (last)
+  --export last|best     export the last policy, or the one that
+                         validated best (last)
   --run-dir DIR          folder to create (runs/PRESET-SEED-TIME)
   --resume DIR           run folder to continue, after Ctrl-C or a kill
 
@@ -113,7 +115,7 @@ and rank the combinations.
 
   NAME                   {sweepable}
   @FILE                  text file with such entries
-  --resume DIR           run folder of a sweep to continue, without entries
+  --resume DIR           run folder of a sweep to continue; give no entries
 
 mjx-balance train --help lists the other flags.
 """
@@ -126,9 +128,9 @@ def overview() -> str:
         for name, command in COMMANDS.items()
     ]
     return (
-        "usage: mjx-balance COMMAND ...\n\nBalance a quadruped on a tilting board by a DQN.\n\n"
+        "usage: mjx-balance COMMAND ...\n\nBalance a quadruped on a tilting board with a DQN.\n\n"
         + "\n".join(rows)
-        + "\n\nmjx-balance COMMAND --help lists a command's flags; --version says the version."
+        + "\n\nmjx-balance COMMAND --help lists its flags; --version prints the version."
     )
 
 
@@ -169,10 +171,10 @@ def value_of(argv: Sequence[str], flag: str, default: str = "") -> str:
 
 
 def check_words(name: str, argv: Sequence[str]) -> None:
-    """Checks the names among a command's words, and of `train` the flags.
+    """Checks the names among a command's words; for `train`, also the flags.
 
     Raises:
-      InputError: for one that does not exist; it says which one may be meant.
+      InputError: for an unknown one; the message suggests a known one.
     """
     if name == "completion":
         return
@@ -205,7 +207,7 @@ def check_words(name: str, argv: Sequence[str]) -> None:
 def first_line(argv: Sequence[str]) -> None:
     """Says that a training begins, before JAX and MuJoCo are imported, which takes seconds.
 
-    Of several processes none says so: which one is the first is not known yet.
+    With several processes it prints nothing: none knows yet whether it is the first.
     """
     if {"--distributed", "--coordinator", "--process-id", "--num-processes"} & set(argv):
         return
@@ -237,7 +239,7 @@ complete -c mjx-balance -a '(mjx-balance completion fish (commandline -xpc)[2..]
 
 
 def completion(argv: list[str]) -> int:
-    """Runs `mjx-balance completion SHELL`, or with more words prints how the last may end."""
+    """Runs `mjx-balance completion SHELL`; with more words, prints completions of the last."""
     shell, *words = argv or [""]
     if shell in HELP:
         print("usage: mjx-balance completion bash|zsh|fish\n\nPrint a script for the shell.")
@@ -249,7 +251,7 @@ def completion(argv: list[str]) -> int:
 
 
 def endings(words: Sequence[str]) -> list[str]:
-    """How the last of a command's words may go on; none where a file may stand."""
+    """Completions of the last of a command's words; none where it may be a file."""
     *before, last = words
     values = {
         "--preset": tuple(PRESETS),

@@ -1,6 +1,6 @@
 """The frozen dataclasses of a config: every number with its unit, bounds and source.
 
-No other module states these numbers again, but for those of our own robot in `robots/`. "paper n"
+No other module repeats these numbers, except those of our own robot in `robots/`. "paper n"
 cites a section of the paper; "chosen" marks a number that the paper does not give.
 """
 
@@ -72,17 +72,18 @@ class TaskConfig:
     sea_period: Positive = 10.0
     """Peak period of the sea, s (chosen: a moderate sea)."""
     platform: bool = False
-    """Whether the board stands on a platform that surges, sways and heaves with the sea; without
-    one, the scene has no joints for it."""
+    """Whether the board stands on a platform that surges, sways and heaves with the sea; only then
+    the scene has joints for it."""
     sea_height: NonNegative = 1.0
-    """Significant height of the platform's heave, crest to trough, m; along the heading it surges
-    and sways by the same (chosen: a slight sea). In training, the greatest: every sea has its own
-    height, uniform from 0."""
+    """Significant height of the platform's heave, crest to trough, m; it surges and sways along the
+    heading by as much (chosen: a slight sea). In training, every sea draws its own height,
+    uniform from 0 to this."""
     sea_heading: Annotated[float, Ge(-360), Le(360)] | None = None
-    """Mean direction in which the waves run, deg from straight ahead to the left; none: any."""
+    """Mean direction in which the waves run, deg from straight ahead to the left; none:
+    drawn at random."""
     start_incline: Annotated[float, Ge(0), Lt(90)] = 0.0
-    """Greatest tilt of the board at the start of a training episode, and of the body that stands on
-    it, deg; in any direction (paper: it starts level)."""
+    """Greatest tilt of board and body at the start of a training episode, in any direction, deg
+    (paper: 0)."""
     fail_tilt: Annotated[float, Gt(0), Lt(90)] = 6.0
     """Body tilt that counts as a fall, deg (paper 3.1)."""
     action_max: Positive = 0.003
@@ -90,15 +91,15 @@ class TaskConfig:
     action_levels: Annotated[int, Ge(3), Le(201)] = 21
     """Height changes per axis (paper Eq. 3: n = 0..20)."""
     action: Literal["grid", "continuous"] = "grid"
-    """What policies and baselines command, and training explores: the grid's height changes (paper
-    Eq. 3), or any up to action_max, for which a policy needs the head "radial"."""
+    """Height changes that policies and baselines command and training explores: those of the grid
+    (paper Eq. 3), or any up to action_max, which need the head "radial"."""
     action_ramp: Annotated[float, Gt(0), Le(1)] = 0.1
     """Share of a decision in which the legs move to their new heights (chosen: the legs are at
     rest before the next decision, and the gyro reads the board's rate; benchmarks/README.md)."""
     gyro_lags: Lags = (0, 1, 2, 3, 4, 5)
-    """Gyro samples in the observation, physics steps back (paper Eq. 2)."""
+    """Ages of the gyro samples in the observation, physics steps (paper Eq. 2)."""
     accel_lags: Lags = (0, 2, 4, 6, 8, 10, 12, 14, 15)
-    """Accelerometer samples in the observation, physics steps back (paper Eq. 2)."""
+    """Ages of the accelerometer samples in the observation, physics steps (paper Eq. 2)."""
     imu_mean: Annotated[int, Ge(1), Le(10_000)] = 1
     """IMU samples averaged into one input, from its lag backwards (paper Eq. 2: 1)."""
     command_lags: CommandLags = ()
@@ -106,7 +107,7 @@ class TaskConfig:
     measured heights they show delayed actions and compliant legs (paper Eq. 2: none)."""
     mean_times: Times = ()
     """Time constants of leaky means of gyro and accelerometer in the observation, s: they show what
-    stays the same, such as a bias (paper Eq. 2: none)."""
+    stays constant, such as a bias (paper Eq. 2: none)."""
     filter_times: Times = ()
     """Time constants of complementary filters, s, whose roll and pitch are in the observation
     (paper Eq. 2: none)."""
@@ -122,11 +123,12 @@ class TaskConfig:
     reward_level: Reward = 0.4
     """Reward for a level body (paper Eq. 4)."""
     reward_sharpness: NonNegative = 1.5
-    """Decay of that reward with the body tilt, 1/deg (paper Eq. 4)."""
+    """Decay of reward_level with the body tilt, 1/deg (paper Eq. 4)."""
     reward_toward: Reward = 0.4
     """Greatest reward for moving toward the horizontal (paper Fig. 5; height chosen)."""
     reward_toward_scale: Scale = 1.0
-    """Decrease of tilt in one decision that earns all of it, deg (paper Fig. 5; scale chosen)."""
+    """Decrease of tilt in one decision that earns all of reward_toward, deg (paper Fig. 5; scale
+    chosen)."""
     reward_fail: Reward = -0.5
     """Added on a fall (paper 3.2)."""
     episode_length: Annotated[int, Ge(1), Le(1_000_000)] = 300
@@ -146,7 +148,8 @@ class TaskConfig:
     def jump_incline(self) -> float:
         """Greatest tilt between jumps, deg.
 
-        The body tilts with a jump before the legs can move: two thirds of fail_tilt at most.
+        A jump is at most two thirds of fail_tilt, because the body tilts with the board before the
+        legs can move.
         """
         return min(self.max_incline, self.fail_tilt / 3)
 
@@ -163,38 +166,38 @@ class RandomizationConfig:
     __pydantic_config__ = STRICT
 
     gyro_noise: NonNegative = 0.0
-    """Standard deviation of every gyro sample, rad/s."""
+    """Standard deviation of the noise on every gyro sample, rad/s."""
     accel_noise: NonNegative = 0.0
-    """Standard deviation of every accelerometer sample, m/s^2."""
+    """Standard deviation of the noise on every accelerometer sample, m/s^2."""
     gyro_bias: NonNegative = 0.0
     """Greatest bias of the gyro on every axis, rad/s."""
     gyro_bias_drift: NonNegative = 0.0
-    """Random walk of that bias, rad/s per square root of a second."""
+    """Random walk of the gyro's bias, rad/s per square root of a second."""
     accel_bias: NonNegative = 0.0
     """Greatest bias of the accelerometer on every axis, m/s^2."""
     accel_bias_drift: NonNegative = 0.0
-    """Random walk of that bias, m/s^2 per square root of a second."""
+    """Random walk of the accelerometer's bias, m/s^2 per square root of a second."""
     imu_scale: Annotated[float, Ge(0), Lt(1)] = 0.0
     """Greatest relative error of the IMU's scale on every axis of gyro and accelerometer."""
     imu_tilt: Annotated[float, Ge(0), Le(0.5)] = 0.0
-    """Greatest turn of the IMU against the trunk about every axis, rad."""
+    """Greatest error of the IMU's mounting angle about every axis, rad."""
     encoder_offset: NonNegative = 0.0
-    """Greatest error of every joint encoder, by which the servos go as well, rad."""
+    """Greatest offset of every joint encoder, rad; the servos use the encoders, too."""
     reading_offset: NonNegative = 0.0
-    """Greatest further error of every joint's reading, of which the servos know nothing, rad."""
+    """Greatest offset of every joint's reading from its encoder, rad; the servos do not see it."""
     sensor_delay: NonNegative = 0.0
-    """Greatest age of the IMU's samples, the same throughout an episode, s."""
+    """Greatest delay of the IMU's samples, s; constant in an episode."""
     sensor_jitter: NonNegative = 0.0
-    """Greatest further age, new in every decision, s."""
+    """Greatest additional delay of the IMU's samples, s; drawn anew in every decision."""
     command_delay: NonNegative = 0.0
-    """Greatest time until the legs begin to obey, the same throughout an episode, s; it adds to
-    that of the robot's file."""
+    """Greatest delay of commands to the legs, s, in addition to that of the robot's file; constant
+    in an episode."""
     command_jitter: NonNegative = 0.0
-    """Greatest further delay, new in every decision, s."""
+    """Greatest additional delay of commands, s; drawn anew in every decision."""
     dropout: Annotated[float, Ge(0), Lt(1)] = 0.0
-    """Share of the IMU's samples that are lost; the last one comes again instead."""
+    """Share of the IMU's samples that are lost; the previous one is repeated."""
     ideal_share: Share = 0.0
-    """Share of the envs in which none of these is wrong, noise apart."""
+    """Share of the envs in which all errors above but noise are zero."""
     payload: NonNegative = 0.0
     """Greatest mass carried on the trunk, kg."""
     payload_offset: NonNegative = 0.05
@@ -208,8 +211,8 @@ class RandomizationConfig:
     gain_spread: Annotated[float, Ge(0), Lt(1)] = 0.0
     """Greatest relative deviation of the servo gains."""
     soft_share: Share = 0.0
-    """Share of the envs whose servos are softer than the robot's, at most as soft as those of
-    `quadruped_soft` for its weight."""
+    """Share of the envs with softer servos than the robot's: at softest those of `quadruped_soft`,
+    scaled to the robot."""
     event_payload: NonNegative = 0.0
     """Greatest mass on the trunk from the middle of an episode on, kg; 0: the load stays."""
     event_grip: Annotated[float, Gt(0), Le(1)] = 1.0
@@ -240,7 +243,7 @@ class RandomizationConfig:
 
     @property
     def sensors_err(self) -> bool:
-        """Whether more is wrong with sensors or commands than noise and a decision's delay."""
+        """Whether sensors or commands have errors other than noise and the delay of a decision."""
         biases = self.gyro_bias, self.gyro_bias_drift, self.accel_bias, self.accel_bias_drift
         offsets = self.imu_tilt, self.encoder_offset, self.reading_offset
         delays = self.sensor_delay, self.sensor_jitter, self.command_delay, self.command_jitter
@@ -258,12 +261,13 @@ class DQNConfig:
     learning_rate: Positive = 1e-5
     """Adam step size (paper 3.2)."""
     learning_rate_end_share: NonNegative = 1.0
-    """Final share of learning_rate, after a cosine decay over the run (paper: constant)."""
+    """Learning rate at the end of the run, as a share of learning_rate; a cosine decay leads there
+    (paper: 1)."""
     batch_size: Count = 32
     """Transitions per gradient step (chosen)."""
     replay_ratio: Positive = 32.0
-    """Transitions replayed per new one: batch_size * gradient steps / env steps (one gradient
-    step per decision, as in a DQN of one env, is a ratio of batch_size)."""
+    """Transitions replayed per new one: batch_size * gradient steps / env steps. One gradient
+    step per env step, as in a DQN with one env, is a ratio of batch_size."""
     replay_capacity: Count = 131_072
     """Transitions in the buffer, rounded down to a multiple of num_envs (chosen)."""
     min_replay_size: Count = 4_096
@@ -271,7 +275,7 @@ class DQNConfig:
     target_update_period: Count = 1_000
     """Gradient steps between copies into the target network (chosen)."""
     epsilon_start: Share = 1.0
-    """Share of random actions at first (chosen)."""
+    """Share of random actions at the start (chosen)."""
     epsilon_end: Share = 0.05
     """Share of random actions after the decay (chosen)."""
     epsilon_decay_steps: Count = 50_000
@@ -285,8 +289,8 @@ class DQNConfig:
     """How the network computes action values (dqn/networks.py): one output per action; the sum
     of one output per level and axis; or a best action and a radial profile around it."""
     zero_at_rest: bool = False
-    """Whether the radial head's best action for an observation of zeros, of a level robot at rest
-    in its stance, is no height change (chosen: no)."""
+    """Make "no height change" the radial head's best action for an observation of zeros, that of a
+    level robot at rest (chosen: no)."""
     whiten_steps: CountFrom0 = 0
     """Env steps over which the covariance of the inputs is estimated, for whitening; 0: no
     whitening (paper)."""
@@ -322,7 +326,7 @@ class Config:
     num_seeds: Count = 1
     """Runs trained at once in one program, with seeds `seed`, `seed + 1`, ..."""
     sweep: tuple[str, ...] = ()
-    """Values to try of the learner's numbers, e.g. `learning_rate=0.001,0.003`: one program trains
+    """Values of the learner's numbers to try, e.g. `learning_rate=0.001,0.003`: one program trains
     every combination with `num_seeds` seeds."""
     num_env_steps: Count = 200_000
     """Decisions of a run, over all envs (paper 4: about 200k)."""

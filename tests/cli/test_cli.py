@@ -439,7 +439,7 @@ def test_a_robots_draft_can_be_checked(capsys: pytest.CaptureFixture[str]) -> No
     assert main(["robot", "check", "rex.toml"]) == 1
     said = capsys.readouterr()
     assert "mjx-balance: robot rex has no torque left at 7 deg" in said.err
-    assert "_knee' takes 100% of its own" in said.err
+    assert "_knee' takes 100% of its limit" in said.err
     assert said.out.endswith("picture: rex-check.png\n")
 
 

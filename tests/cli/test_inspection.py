@@ -57,8 +57,8 @@ def test_what_is_said_of_a_robot(spot: tuple[Scene, TiltTest]) -> None:
     ]
     assert "hind right" in lines[7]
     assert "foot 298 mm behind, 166 mm to the right" in lines[7]
-    assert "follow 4.45 deg/s, 1.27 of the board's 3.5" in lines[9]
-    assert "the legs follow 17.8 deg on both axes at once" in lines[10]
+    assert "turn the trunk by 4.45 deg/s, 1.27 times the board's 3.5" in lines[9]
+    assert "the legs can level 17.8 deg on both axes at once" in lines[10]
     share = re.search(
         r"stands still, level to 0\.\d+ deg; .* takes (\d+)% of its torque", lines[11]
     )
@@ -136,7 +136,7 @@ def test_torques_that_nobody_limits_are_asked_for(spot: tuple[Scene, TiltTest]) 
     scene, got = spot
     robot = dataclasses.replace(scene.robot, knee_torque=UNLIMITED)
     line = describe(dataclasses.replace(scene, robot=robot), got)[11]
-    assert "its model limits no torque: say hip_torque and knee_torque, in N m" in line
+    assert "its model has no torque limits: set hip_torque and knee_torque, in N m" in line
     assert "%" not in line
 
 
@@ -164,7 +164,7 @@ def test_torques_that_no_robot_has_are_said(spot: tuple[Scene, TiltTest]) -> Non
     assert not [line for line in describe(scene, got) if line.startswith("warning")]
     robot = dataclasses.replace(scene.robot, knee_torque=3250.0)
     lines = describe(dataclasses.replace(scene, robot=robot), got)
-    assert lines[-1].startswith("warning: knee_torque is 3250 N m, 10 times what holds")
+    assert lines[-1].startswith("warning: knee_torque is 3250 N m, 10 times the robot's weight")
 
 
 def test_places_are_seen_from_the_trunks_origin(spot: tuple[Scene, TiltTest]) -> None:
