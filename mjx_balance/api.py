@@ -1,4 +1,4 @@
-"""Training and evaluation in Python: what `mjx_balance.train` and `mjx_balance.evaluate` are."""
+"""Training and evaluation in Python: `mjx_balance.train` and `mjx_balance.evaluate`."""
 
 import dataclasses
 import json
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class TrainingResult:
-    """What a training gives."""
+    """The result of a training."""
 
     policy: "Policy | OwnPolicy"
     """The greedy policy; of several seeds the best on the validation scenarios. With a network of
@@ -63,15 +63,15 @@ def train(
 ) -> TrainingResult:
     """Trains a policy and evaluates it in plain MuJoCo, as `mjx-balance train` does.
 
-    It works on the JAX devices that there are. In a process that has not used JAX yet, it makes
-    every CPU core one; in a notebook in which JAX is in use, they stay as they are. In a thread
-    other than the main one, signals stay the app's own.
+    If the process has not used JAX yet, every CPU core becomes a JAX device; otherwise, JAX's
+    devices stay as they are. In the main thread, Ctrl-C and SIGTERM save and stop the run; in any
+    other thread, signals are left to the app.
 
     Args:
       config: a config, or a preset's name; None: preset "default", or that of the run to resume.
       run_dir: folder to create for the run, with checkpoints, figures and all else that
-        `mjx-balance train` writes; None: nothing stays. After an interrupt the folder stays either
-        way, and the message names it.
+        `mjx-balance train` writes; None: no files remain. After an interrupt the folder remains
+        in both cases, and the message names it.
       callbacks: functions of a line's metrics, or `Callback` objects.
       progress: whether to show progress on standard output.
       resume: run folder to continue, instead of `run_dir`.
@@ -79,9 +79,10 @@ def train(
       loss: a loss of one transition of your own, with the arguments of `dqn.td_error`; None: ours.
 
     Raises:
-      ConfigError, RunFolderError, CheckpointError: for what cannot be used; one sentence says why.
+      ConfigError, RunFolderError, CheckpointError: for an argument that cannot be used; one
+        sentence says why.
       PolicyError: if no seed learnt finite numbers.
-      Interrupted: if the user stopped the run; the message says how to go on.
+      Interrupted: if the user stopped the run; the message says how to resume it.
     """
     if resume is not None and run_dir is not None:
         raise InputError("resume continues a folder in place; leave run_dir out")
@@ -153,7 +154,8 @@ def evaluate(
       of `scenarios`, and more.
 
     Raises:
-      PolicyError, SuiteError, EvaluationError: for what cannot be used; one sentence says why.
+      PolicyError, SuiteError, EvaluationError: for an argument that cannot be used; one sentence
+        says why.
     """
     find_suite(suite)
     if isinstance(policy, (str, os.PathLike)):

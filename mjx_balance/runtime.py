@@ -7,8 +7,9 @@ This file needs no other file of the package. Copy it to the robot, beside a pol
     while True:  # once per IMU sample, 250 Hz
         targets = controller.step(joint_positions, gyro, accelerometer)
 
-The targets are pure kinematics. If the servos sag under the robot's weight, add their trim to the
-targets, as the simulation adds `scene.stance.leg_trim`; servos with an integral term need none.
+The targets follow from kinematics alone. If the servos sag under the robot's weight, add their trim
+to the targets, as the simulation adds `scene.stance.leg_trim`; servos with an integral term need
+none.
 
 The controller holds when a reading is impossible, or when the robot no longer balances: the targets
 then stay the same until `reset`. The robot must be back at its standing height before `reset`. The
@@ -110,16 +111,16 @@ class State(str, enum.Enum):
 
 
 class Fault(enum.IntEnum):
-    """What was wrong; `RESPONSES` says what follows."""
+    """What is wrong; `RESPONSES` gives the state that follows."""
 
     NONE = 0
     HELD = 1  #: the program called `hold`
     DAMPED = 2  #: the program called `damp`
-    READING = 3  #: no numbers, another shape, or outside of a sensor's range
-    CLOCK = 4  #: the clock gives no time
+    READING = 3  #: not a number, a wrong shape, or outside a sensor's range
+    CLOCK = 4  #: the clock does not give a finite time
     LATE = 5  #: a sample came too late, or before the last one
-    RATE = 6  #: the samples of a decision took another time than in training
-    STALE = 7  #: the IMU repeats itself
+    RATE = 6  #: the samples of a decision came at a wrong rate
+    STALE = 7  #: the IMU repeats old samples
     STUCK = 8  #: a joint's reading stays the same while its target moves
     NETWORK = 9  #: the network gives values that are not finite
     WEIGHT = 10  #: the mean acceleration is far from 9.81 m/s^2
@@ -175,18 +176,19 @@ class Controller:
         Args:
           path: of the policy file.
           clock: returns the current time, s; in simulation, pass the simulation's.
-          gains: whether the servos obey `stiffness`, `damping` and `torque`. If not, the targets
-            are all that moves the robot, and every fault leads to HOLDING.
-          sample_rate: rate at which `step` is called, Hz; None: that of training. It must be a
-            whole multiple of that. The IMU's samples are then averaged, so that vibrations above
-            half the rate of training do not look like slow motions; of the joints the last count.
+          gains: whether the servos obey `stiffness`, `damping` and `torque`. If not, they
+            follow the targets alone, and every fault leads to HOLDING.
+          sample_rate: rate at which `step` is called, Hz, a whole multiple of the rate in
+            training; None: that rate. The IMU's samples are then averaged, so that vibrations above
+            half the rate in training do not look like slow motions; of joint readings, the last
+            one counts.
           max_torque: greatest mean torque of a joint over a decision, N m, one or (legs, 3); None:
             `TORQUE_SHARE` of the robot's own limits.
           max_temperature: greatest mean temperature of a servo over a decision, deg C.
 
         Raises:
           PolicyFileError: if the file is missing, damaged, or not a policy that this file can run,
-            or with `gains`, if it does not say the robot's gains.
+            or with `gains`, if it does not give the robot's gains.
           ValueError: for a sample rate that is no such multiple.
         """
         try:
@@ -259,9 +261,9 @@ class Controller:
         return self._loaded * self.model.gains[0] * self.model.trim
 
     def reset(self) -> None:
-        """Starts again, STANDING, or PASSIVE if the servos obey the gains.
+        """Starts again in state STANDING, or PASSIVE if the servos obey the gains.
 
-        A robot that is then STANDING must stand still at its standing height.
+        In state STANDING the robot must stand still at its standing height.
         """
         self.state = State.PASSIVE if self._obeyed else State.STANDING
         self.fault = Fault.NONE  #: why it is HOLDING or DAMPING
@@ -283,8 +285,8 @@ class Controller:
     def stand(self) -> None:
         """Stands up from the pose of the next sample, then balances; only PASSIVE or STANDING.
 
-        In `GAIN_RISE_S` the stiffness comes up. Then the feet come under the hips, and the legs
-        lift the trunk to its standing height. Balancing begins when the robot is still: no gyro
+        The stiffness rises in `GAIN_RISE_S`. Then the feet move under the hips, and the legs lift
+        the trunk to its standing height. Balancing begins when the robot is still: no gyro
         reading of a decision's samples is above `STILL_RATE`.
         """
         if self.state in (State.PASSIVE, State.STANDING):
@@ -334,8 +336,8 @@ class Controller:
           joint_positions: (legs, 3) abduction, hip and knee angles, rad, in the order of `joints`.
           gyro: (3,) rad/s; x forward, y left, z up.
           accelerometer: (3,) m/s^2, same axes; about (0, 0, 9.81) at rest.
-          quaternion: (4,) orientation of the trunk in the world, w first, if the IMU gives it. Only
-            to notice a fall at once, whatever pushes do to the accelerometer.
+          quaternion: (4,) orientation of the trunk in the world, w first, if the IMU gives it. It
+            shows a fall at once; the accelerometer needs a mean, because pushes shake it.
           torques: (legs, 3) measured torques of the servos, N m.
           temperatures: (legs, 3) of the servos, deg C.
 

@@ -131,8 +131,8 @@ class DQN:
     """Trains a Q-network on a brax env.
 
     Args:
-      env: unbatched, with `action_size` discrete actions, or with `spec.continuous` as many
-        numbers from -1 to 1; `info["truncation"]`, if there, marks time-outs.
+      env: unbatched, with `action_size` discrete actions; with `spec.continuous`, an action is
+        `action_size` numbers from -1 to 1; `info["truncation"]`, if there, marks time-outs.
       network: maps (..., obs_size) to (..., action_size): a `QNetwork` or another `Network`.
       spec: the numbers of the run.
       own_loss: loss of a transition, averaged over a batch; None: that of `DQN.loss`.
@@ -405,8 +405,8 @@ class DQN:
     def fold(self, params: Params, statistics: RunningStatistics) -> Params:
         """Folds the whitening into the parameters, which is cheaper than whitening every input.
 
-        Parameters of a network that does not know how become `Whitened`. With `zero_at_rest`, the
-        head's best point for an observation of zeros then becomes 0.
+        If the network has no `fold_whitening`, its parameters become `Whitened`. With
+        `zero_at_rest`, the head's best point for an observation of zeros then becomes 0.
         """
         network: Any = self.network
         if self.spec.config.whiten_steps:

@@ -1,4 +1,4 @@
-"""Q-networks: ours, and what any other needs."""
+"""Our Q-network, and the protocol for any other."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
@@ -11,7 +11,7 @@ from mjx_balance.policy import heads
 
 
 class Network(Protocol):
-    """What the DQN needs of a network. A flax module has both, if its call gives action values.
+    """Methods that a network must have. A flax module whose call returns action values has them.
 
     A network may have three more methods, as `QNetwork` has:
 
@@ -22,7 +22,7 @@ class Network(Protocol):
     """
 
     def init(self, key: Any, obs: Any, /) -> Any:
-        """Returns parameters, a pytree, by a PRNG key and an observation (obs_size,)."""
+        """Returns parameters, a pytree, from a PRNG key and an observation (obs_size,)."""
         ...
 
     def apply(self, params: Any, obs: Any, /, **method: Any) -> Any:

@@ -23,7 +23,7 @@ from mjx_balance.task.tilt import MOST_CALLS, draw_scenario
 
 
 class Metric(NamedTuple):
-    """A row of an env's table `metrics`: how a metric's mean is logged, if not as it is."""
+    """A row of an env's table `metrics`: how the mean of a metric is logged."""
 
     name: str | None = None  #: logged name; None: its own
     per: Literal["decision", "minute", "call"] = "decision"
@@ -40,7 +40,7 @@ class BalanceEnv(Env):
     terminations. A done env is not reset by `step`: the observation it returns is the one before
     the reset.
 
-    Written for one board; `jax.vmap` it over thousands. For brax's own trainers:
+    This is one env; `jax.vmap` it over thousands. For brax's own trainers:
     `envs.brax.wrap`.
     """
 
@@ -60,7 +60,7 @@ class BalanceEnv(Env):
             `action_max`, -1 to 1; None: as `config.task.action`, discrete without a config.
 
         Raises:
-          ConfigError: if the config cannot be run, or for another kind of action.
+          ConfigError: if the config is invalid, or for another kind of action.
         """
         self.config = check(config or preset("default"))
         self._discrete = check_action(action, config and config.task) == "discrete"
@@ -74,17 +74,17 @@ class BalanceEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """Number of discrete actions, or of the numbers that make a continuous one."""
+        """Number of discrete actions, or of numbers in a continuous action."""
         return self.config.task.num_actions if self._discrete else ACTION_AXES
 
     @property
     def action_factors(self) -> tuple[int, ...]:
-        """A discrete action as a mixed-radix number: levels of roll, levels of pitch."""
+        """Levels of roll and of pitch; a discrete action is a mixed-radix number of them."""
         return (self.config.task.action_levels,) * ACTION_AXES
 
     @property
     def symmetries(self) -> Symmetries:
-        """How observations and actions look in a mirror."""
+        """Reflections of observations and actions."""
         return symmetries(self.config.task, self.scene.robot, self.continuous)
 
     @property
@@ -98,7 +98,7 @@ class BalanceEnv(Env):
         return self.config.engine
 
     def reset(self, rng: jax.Array) -> State:
-        """Starts a fresh tilt scenario from the settled stance, by a PRNG key."""
+        """Starts a new tilt scenario from the settled stance, drawn from a PRNG key."""
         task, robot, scene = self.config.task, self.scene.robot, self.scene
         ranges, params, pushes = self.config.randomization, None, None
         errors = None

@@ -1,4 +1,4 @@
-"""`BatchEnv`: many envs in plain MuJoCo, in NumPy, as `BalanceEnv` is one in JAX. No JAX."""
+"""`BatchEnv`: many envs in plain MuJoCo and NumPy, the counterpart of `BalanceEnv`. No JAX."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 class Episodes(NamedTuple):
-    """What n episodes consist of, besides a robot and its actions; all arrays begin with n."""
+    """Scenarios and random numbers of n episodes; n is the leading axis of all arrays."""
 
     scenario: Scenario  #: where the boards go
     params: DomainParams | None = None  #: None: nominal
@@ -84,7 +84,7 @@ class BatchEnv:
         """(n, obs_size) at the start of the episodes."""
 
     def reset(self, ids: Int[np.ndarray, " k"], episodes: Episodes) -> None:
-        """Starts envs `ids` anew; episodes have what may be None if the first ones had it."""
+        """Restarts envs `ids`; fields that are None must be None in the first episodes, too."""
         start = self._initial(ids, episodes)
         _set_rows(self.state, ids, start)
         self.initial_obs[ids] = self._observe_start(start)

@@ -1,8 +1,8 @@
-"""What brax's trainers need to train `BalanceEnv`: `ppo.train(env, wrap_env_fn=wrap, ...)`.
+"""A wrapper of `BalanceEnv` for brax's trainers: `ppo.train(env, wrap_env_fn=wrap, ...)`.
 
-brax's own wrapping starts an episode again with its first `pipeline_state` and observation and
-leaves `info` alone: every episode of an env would have the same scenario and domain parameters, and
-its sensor noise would go on with the old key.
+brax's own wrapper resets an env to its first `pipeline_state` and observation and keeps `info`: all
+episodes of an env would have the same scenario and domain parameters, and its sensor noise would
+continue with the old key.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ if not hasattr(jax, "device_put_replicated"):
 def wrap(
     env: BalanceEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None
 ) -> Wrapper:
-    """As `brax.envs.training.wrap`, but that every episode is a new scenario.
+    """As `brax.envs.training.wrap`, but every episode is a new scenario.
 
     Raises:
       ValueError: if `episode_length` is above the env's own, or there is a randomization_fn: the

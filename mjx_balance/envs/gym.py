@@ -174,7 +174,7 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):  # pyright: ignor
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts a fresh scenario from the settled stance; without a seed the generator goes on.
+        """Starts a new scenario from the settled stance; without a seed, the generator continues.
 
         Raises:
           ValueError: if there are options; none exist.
@@ -192,7 +192,7 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):  # pyright: ignor
         """Takes one decision.
 
         Raises:
-          InvalidAction: for what is not in the action space.
+          InvalidAction: for an action outside the action space.
           ResetNeeded: before the first reset, and after the end of an episode.
         """
         if not self._running or self.batch is None:
@@ -232,9 +232,9 @@ class BalanceGymEnv(_Balance, gymnasium.Env[np.ndarray, Any]):  # pyright: ignor
 
 
 class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):  # pyright: ignore
-    """Many envs in `mujoco.batch.Batch`, on all cores; env k does what one alone would do.
+    """Many envs in `mujoco.batch.Batch`, on all cores; env k equals a single env with its seed.
 
-    An env that terminates or is truncated starts anew as Gymnasium's `autoreset_mode` says. In mode
+    An env that terminates or is truncated is reset as Gymnasium's `autoreset_mode` says. In mode
     SAME_STEP its observation is the first of the new episode; `final_obs` and `final_info` are of
     the old one.
     """
@@ -303,7 +303,7 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):  #
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts fresh scenarios in all envs, or in those of a mask.
 
-        Env k gets seed `seed + k`, or `seed[k]`; one that gets none goes on with its generator.
+        Env k gets seed `seed + k`, or `seed[k]`; without a seed, its generator continues.
 
         Args:
           seed: of the scenarios.
@@ -347,10 +347,10 @@ class BalanceVecEnv(_Balance, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):  #
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Takes one decision in every env, but where mode NEXT_STEP starts an episode instead.
+        """Takes one decision in every env; in mode NEXT_STEP, an env that is done is reset instead.
 
         Raises:
-          InvalidAction: for what is not in the action space.
+          InvalidAction: for an action outside the action space.
           ResetNeeded: before the first reset, and in mode DISABLED after the end of an episode.
         """
         change = self._height_changes(actions, self.action_space)

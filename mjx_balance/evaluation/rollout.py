@@ -1,4 +1,4 @@
-"""Controllers rolled out in plain MuJoCo on all cores, and a summary of it. No JAX.
+"""Rolls controllers out in plain MuJoCo on all cores, and summarises the result. No JAX.
 
 The engine runs as MuJoCo ships it: C, float64, default solver accuracy. From a fall
 to the scenario's end the tilt counts as `fail_tilt`, so falling never helps; a
@@ -35,7 +35,7 @@ class EvaluationError(InputError):
 
 
 class GreedyPolicy(Protocol):
-    """What an evaluation needs of a policy."""
+    """Attributes that an evaluation needs of a policy."""
 
     config: Config
     robot: Robot
@@ -47,7 +47,7 @@ class GreedyPolicy(Protocol):
 
 
 def observing(policy: GreedyPolicy) -> Controller:
-    """The policy as a controller: it looks at the observation alone."""
+    """The policy as a controller that sees only the observation."""
     return lambda view: policy.command(view.obs)
 
 
@@ -191,13 +191,13 @@ def policy_scene(policy: GreedyPolicy, robot: str | None = None) -> Scene:
     """Builds the scene a policy was trained in.
 
     Args:
-      policy: from a file that anybody may have written. It names its robot, but opens no file and
-        no package: without `robot` its robot must be a shipped one.
-      robot: name of its robot here, as `Config.robot`.
+      policy: may come from a stranger. So the robot that it names is never opened as a file or
+        package: without `robot`, it must be a shipped one.
+      robot: the policy's robot on this machine, as in `Config.robot`.
 
     Raises:
-      PolicyError: if the robot is not here, is another one, or today's scene files or engine
-        give another scene.
+      PolicyError: if the robot is missing or another one, or if the current scene files or
+        engine give another scene.
     """
     name = robot or policy.config.robot
     if robot is None and name not in shipped():
@@ -262,7 +262,7 @@ def evaluate(
 
 
 def check_fits(task: TaskConfig, scenarios: int, duration: float, recorded: int = 0) -> None:
-    """Refuses an evaluation of nothing, or of more than the memory holds.
+    """Refuses an evaluation without scenarios or time, or of more than the memory holds.
 
     Its scenarios last `duration` s; `recorded` values are stored per physics step, besides the
     tilt.

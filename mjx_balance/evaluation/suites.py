@@ -1,4 +1,4 @@
-"""The evaluation suites: scenarios, domain parameters and pushes that a controller is tried on."""
+"""The evaluation suites: scenarios, domain parameters and pushes to test a controller with."""
 
 import dataclasses
 import math
@@ -35,7 +35,7 @@ def _corner(incline: np.ndarray, uniform: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """A kind of scenario. One of your own goes wherever a suite's name does."""
+    """A kind of scenario. Pass one of your own wherever a suite's name is accepted."""
 
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     targets: Callable[[np.ndarray, np.ndarray], np.ndarray] = _disc
@@ -108,7 +108,7 @@ SEEDS = Seeds()
 
 
 def check_seed(seed: int) -> None:
-    """Raises `SuiteError` for a seed that nothing can be drawn by."""
+    """Raises `SuiteError` for a seed that is not valid."""
     if seed < 0:
         raise SuiteError(f"seed is {seed}; it must not be negative")
 
@@ -143,8 +143,8 @@ def draw_suite(
     """Draws a suite's episodes, each of `duration` s.
 
     Scenario k of a seed is the same however many are drawn. Ramps, sensor noise, pushes, other
-    motions, starts, sensor errors and events come from generators of their own, told apart by their
-    last number.
+    motions, starts, sensor errors and events each have their own generator, which
+    differs in the last number of its seed.
 
     Raises:
       ConfigError: if the sea of the config is out of bounds, or a decision shorter than the delays.
@@ -217,9 +217,9 @@ def draw_suite(
 def standing_still(
     task: TaskConfig, robot: Robot, suite: str, scenarios: int, duration: float, seed: int
 ) -> float:
-    """Mean tilt, deg, of a robot that stands still, to compare with, without a simulation.
+    """Mean tilt, deg, of a robot that stands still, for comparison; needs no simulation.
 
-    It tilts as the board does, and from a fall on by `fail_tilt`, as in `rollout.summarize`.
+    It tilts with the board; after a fall its tilt is `fail_tilt`, as in `rollout.summarize`.
 
     Raises:
       ConfigError, SuiteError: as `draw_suite`.

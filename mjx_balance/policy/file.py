@@ -72,7 +72,7 @@ def convert_policy(
 def upgrade_policy(
     path: Path, action: str | None = None, leg_trim: np.ndarray | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Manifest and weights that `convert_policy` writes; raises as it does, but for `OSError`."""
+    """Manifest and weights that `convert_policy` writes; raises the same, except `OSError`."""
     manifest, weights = read_policy(path)
     with naming(path):
         policy = Policy(upgrade(manifest), weights)

@@ -76,8 +76,8 @@ def sketch(model: str, path: Path, strip: Sequence[str] = ()) -> tuple[str, list
       strip: bodies to leave out, and joints to fix.
 
     Returns:
-      The text, and what has to be mended, one sentence each. Then the text says so too, and lines
-      that are not complete are comments.
+      The text, and what the user has to complete, one sentence each; the text names it as well,
+      with incomplete lines as comments.
 
     Raises:
       RobotError: if the model cannot be read, or has nothing that could be a leg.

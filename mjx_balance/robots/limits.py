@@ -13,7 +13,7 @@ def for_robot(config: Config, robot: str | RobotFile) -> Config:
     """Adapts a config of our own robot to another robot.
 
     Standing height and greatest height change become the robot's (`robots.measure`). Payloads scale
-    with its mass; offsets and the scale of foot heights with its size; pushes with the speed from
+    with its mass; offsets and the scale of foot heights with its size; pushes with the speed at
     which it tips over. Angles, board rate and fall limit stay. A `RobotFile` made in Python becomes
     known by its name, in this process (`catalogue.use_robot`).
 
@@ -60,7 +60,7 @@ def delay_steps(task: TaskConfig, robot: Robot) -> int:
 
 
 def check_delays(task: TaskConfig, ranges: RandomizationConfig, robot: Robot) -> None:
-    """Checks that samples and commands come within their decision.
+    """Checks that the delays of samples and commands end within their decision.
 
     Raises:
       ConfigError: names the greatest delay, its jitter and a bound.
@@ -79,7 +79,7 @@ def check_delays(task: TaskConfig, ranges: RandomizationConfig, robot: Robot) ->
 
 
 def check_body(body: Body) -> None:
-    """Checks a body that was measured elsewhere.
+    """Checks a body read from a policy file.
 
     Raises:
       ConfigError: names the leg and its field.

@@ -2,8 +2,8 @@
 
 `step` is `pre_step` (action -> servo targets), an engine (targets -> motion) and `post_step`
 (motion -> observation, reward, failure). Training calls it in JAX for one env, vmapped; evaluation
-and Gymnasium's envs in NumPy for many envs at once. What is random is drawn outside: JAX and NumPy
-draw differently.
+and Gymnasium's envs in NumPy for many envs at once. Random numbers are drawn outside, because
+JAX and NumPy draw differently.
 """
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -45,7 +45,7 @@ DIVERGED = 1e4  #: magnitude, in rad, rad/s, m/s^2 or deg, from which a value co
 
 
 class Memory(NamedTuple):
-    """What one decision leaves to the next, besides the state of the physics."""
+    """What one decision passes to the next, besides the state of the physics."""
 
     heights: Float[Array, "*batch legs"]  #: foot heights that the legs moved to last, m
     commanded: Float[Array, "*batch decisions legs"]
@@ -102,7 +102,7 @@ class EnvState(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of a decision."""
+    """The result of a decision."""
 
     obs: Float[Array, "*batch obs_size"]  #: the network's next input
     rewards: dict[str, Float[Array, "*batch"]]  #: by name (`reward_terms`); their sum is the reward
@@ -166,7 +166,7 @@ def initial_memory(
       robot: the same.
       still: true IMU samples, rad/s and m/s^2.
       tilt: of the body, deg; None: level.
-      errors: of the sensors; None: they are right.
+      errors: of the sensors; None: no errors.
     """
     xp, rows, sensors = still.__array_namespace__(), input_rows(task, robot), None
     if errors is not None:
@@ -192,8 +192,8 @@ def pre_step(
 ) -> tuple[Memory, Targets]:
     """Turns an action, a_x and a_y in m, into servo targets and the memory with the new command.
 
-    Targets of step i are for time (i + 1) * sim_dt of the decision. With an action delay the legs
-    obey one decision later; with a command delay, so much later in the decision.
+    Targets of step i are for time (i + 1) * sim_dt of the decision. An action delay
+    delays the targets by one decision, a command delay by its time within the decision.
     `state.physics` does not matter.
     """
     memory, xp = state.memory, state.memory.heights.__array_namespace__()
@@ -225,8 +225,8 @@ def post_step(
 ) -> tuple[Memory, Outcome]:
     """Turns the motion of a decision into observation, reward and failure.
 
-    Where the simulation diverged the robot has fallen: its tilt counts as `fail_tilt` throughout
-    the decision, the IMU holds its last sample, and the legs count as at their targets.
+    An env whose simulation diverged counts as fallen: its tilt is `fail_tilt` throughout the
+    decision, the IMU keeps its last sample, and the legs count as at their targets.
 
     `memory` is that of `pre_step`; `motion` has what the sensors give. Returns the memory for the
     next decision, and the outcome.

@@ -1,4 +1,4 @@
-"""What a training run tells others: every line of metrics, every validation, its beginning and end.
+"""Calls of the user's code during a run: at its start and end, every log line and validation.
 
 The first process of a run calls them, between two calls of the training program, in the thread that
 called `train`.
@@ -18,8 +18,8 @@ LogFunction: TypeAlias = Callable[[Mapping[str, float]], object]
 class Callback:
     """Listens to a run. Override what you need.
 
-    `on_log` and `on_validation` may return True to stop the run: as at its end, its state is saved,
-    its policy exported and evaluated. An exception ends the run at once, and `train` raises it.
+    `on_log` and `on_validation` may return True to stop the run: it then saves its state, exports
+    its policy and evaluates it. An exception ends the run at once, and `train` raises it.
     """
 
     def on_start(self, config: Config, folder: Path) -> None:
@@ -49,7 +49,7 @@ class Callback:
         """
 
     def close(self) -> None:
-        """At last, whatever has happened."""
+        """Called last, also after a failure or an interrupt."""
 
 
 class Callbacks(Callback):

@@ -1,4 +1,4 @@
-"""The greedy policy of a network of the user's own, which no policy file describes."""
+"""The greedy policy of a user's own network, which no policy file describes."""
 
 from typing import Any
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Options(NamedTuple):
-    """What an engine is made with, besides the scene."""
+    """Arguments of an engine, besides the scene."""
 
     solver_iterations: int  #: of MJX's constraint solver; MuJoCo's C engine stops by itself
     line_search_iterations: int
@@ -24,7 +24,7 @@ class Options(NamedTuple):
 
 
 class EngineRow(NamedTuple):
-    """One engine, and what the rest of the package needs to know of it."""
+    """One engine, and what the rest of the package needs to know about it."""
 
     name: str  #: as in `Config.engine`
     make: str  #: `MODULE:FUNCTION` of this folder, imported when called
