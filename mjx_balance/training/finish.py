@@ -97,7 +97,9 @@ def _export(run: Run, weights: Params, manifest: dict[str, Any]) -> AnyPolicy:
         return save_policy(file, weights, manifest)
     write_atomically(file, best.read_bytes())
     policy = load_policy(file)
-    run.display.say(f"seed {seed}: of {best.parent.name} decisions, the best by validation")
+    run.display.say(
+        f"seed {seed}: policy after {best.parent.name} decisions, the best by validation"
+    )
     return policy
 
 
@@ -132,7 +134,7 @@ def finish(run: Run, policies: list[AnyPolicy], start_time: float) -> Finished:
             _draw(folder, policy, config.robot, bar)
     except Exception as error:
         reason = shorten(error, MESSAGE) or type(error).__name__
-        run.display.say(f"not all figures and curves are there: {reason}")
+        run.display.say(f"some figures or curves are missing: {reason}")
     folder.drawing.unlink()
     took = time.perf_counter() - start_time
     tables.print_summary(console, folder.path, results, took, config.robot)

@@ -74,7 +74,7 @@ class Profiled:
         except Exception as error:  # the trace ends no run that learns
             if results is None:
                 raise
-            self.log_fn(f"the trace in {self.folder} cannot be summed up: {shorten(error)}")
+            self.log_fn(f"the trace in {self.folder} cannot be summarised: {shorten(error)}")
         return results
 
     def _sum_up(self) -> None:

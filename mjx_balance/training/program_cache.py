@@ -102,7 +102,7 @@ def enable_compilation_cache(log_fn: LogFn) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        log_fn(f"nothing is cached, {error.filename} cannot be used: {error.strerror}")
+        log_fn(f"programs are not cached, {error.filename} cannot be used: {error.strerror}")
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
@@ -124,7 +124,7 @@ def mending_xla_cache(log_fn: LogFn) -> Iterator[None]:
         folder = cache_dir() / COMPILED
         for entry in folder.glob(f"{module}-*-cache"):
             entry.unlink(missing_ok=True)
-        log_fn(f"compiled anew: what {folder} had of {module} was damaged")
+        log_fn(f"compiled again: the entry of {module} in {folder} was damaged")
 
 
 def versions() -> dict[str, str | None]:
@@ -222,7 +222,7 @@ def _load(path: Path, log_fn: LogFn) -> export.Exported | None:
     except FileNotFoundError:
         return None
     except Exception as error:  # whatever JAX raises for bytes that are no program
-        log_fn(f"the cached program {path} is made anew: {shorten(error)}")
+        log_fn(f"the cached program {path} is replaced: {shorten(error)}")
         return None
 
 

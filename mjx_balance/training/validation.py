@@ -110,5 +110,5 @@ def best_validated(folder: RunFolder, seed: int, log_fn: Callable[[str], None]) 
             training = load_policy(file).manifest["training"]
             scores.append((*score(training["validation"]), training["env_steps"], file))
         except PolicyError as error:
-            log_fn(f"not chosen from: {error}")
+            log_fn(f"validated policy left out: {error}")
     return min(scores)[-1] if scores else None

@@ -250,7 +250,7 @@ def test_a_picture_that_fails_is_a_sentence_and_the_results_are_there(
     monkeypatch.setattr(finish, "_draw", mock.Mock(side_effect=error))
     results = finished(1.0)
     assert json.loads(folder.evaluation.read_text()) == results
-    assert display.lines[-1] == f"not all figures and curves are there: {error}"
+    assert display.lines[-1] == f"some figures or curves are missing: {error}"
     assert calls[-1] == "summary"
     folder.config.write_text("{}")
     with pytest.raises(RunFolderError, match="is finished"):
@@ -263,7 +263,7 @@ def test_curves_that_cannot_be_written_lose_no_result(
     folder.tensorboard.write_text("no folder")
     results = finished(1.0)
     assert json.loads(folder.evaluation.read_text()) == results
-    assert "not all figures and curves are there: " in display.lines[-1]
+    assert "some figures or curves are missing: " in display.lines[-1]
 
 
 def test_a_sweep_is_ranked_by_falls_and_tilt_of_its_seeds(

@@ -99,7 +99,7 @@ def test_a_trace_on_a_full_disk_ends_no_run(
     program = compile_program(jax.jit(lambda x: (x + 1, x)), jnp.zeros(()), None, pytest.fail)
     assert float(Profiled(program, tmp_path, lines.append, SKIPPED)(jnp.float32(3))[0]) == 4
     reason = "[Errno 28] No space left on device"
-    assert lines == [f"the trace in {tmp_path} cannot be summed up: {reason}"]
+    assert lines == [f"the trace in {tmp_path} cannot be summarised: {reason}"]
     failing: Any = mock.Mock(side_effect=ValueError("of the program"))
     with pytest.raises(ValueError, match="of the program"):
         Profiled(failing, tmp_path, lines.append, SKIPPED)(jnp.float32(3))

@@ -99,7 +99,7 @@ def test_a_damaged_program_is_logged_and_replaced(
     again = Counter()
     check_run(compile_program(again.program, start(), "key", lines.append))
     assert again.traced == 1
-    assert lines == [f"the cached program {file} is made anew: it is damaged"]
+    assert lines == [f"the cached program {file} is replaced: it is damaged"]
     compile_program(again.program, start(), "key", pytest.fail)
     assert again.traced == 1
 
@@ -109,7 +109,7 @@ def test_a_run_works_without_a_cache_that_it_cannot_write(cache: Path) -> None:
     lines: list[str] = []
     check_run(compile_program(Counter().program, start(), "key", lines.append))
     program_cache.enable_compilation_cache(lines.append)
-    assert lines == [f"nothing is cached, {cache / 'traced'} cannot be used: Not a directory"]
+    assert lines == [f"programs are not cached, {cache / 'traced'} cannot be used: Not a directory"]
     assert cache.read_text() == "no folder"
 
 
@@ -137,7 +137,7 @@ def test_a_program_that_another_user_may_have_planted_never_runs(
     assert counter.traced == 1
     before = jax.config.jax_compilation_cache_dir
     program_cache.enable_compilation_cache(lines.append)
-    assert lines == [f"nothing is cached, {cache / planted} cannot be used: {reason}"]
+    assert lines == [f"programs are not cached, {cache / planted} cannot be used: {reason}"]
     assert jax.config.jax_compilation_cache_dir == before
 
 
@@ -188,7 +188,7 @@ def test_what_is_no_program_is_a_miss(cache: Path, content: bytes) -> None:
     check_run(compile_program(counter.program, start(), "key", lines.append))
     assert counter.traced == 1
     [line] = lines
-    assert "is made anew: " in line
+    assert "is replaced: " in line
 
 
 def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,7 +200,8 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> 
     program_cache.enable_compilation_cache(lines.append)
     check_run(compile_program(Counter().program, start(), "key", lines.append))
     assert lines == [
-        "nothing is cached, the user's home cannot be used: there is none; set MJX_BALANCE_CACHE"
+        "programs are not cached, the user's home cannot be used: there is none; "
+        "set MJX_BALANCE_CACHE"
     ]
     assert sizing._measured_sizes() == {}
 
@@ -242,7 +243,7 @@ def test_what_xla_finds_damaged_is_logged_and_removed(xla_cache: Path) -> None:
     whole.write_bytes(whole.read_bytes()[:50])
     other = xla_cache / "jit_other-1-cache"
     other.write_text("not looked at")
-    assert start() == [f"compiled anew: what {xla_cache} had of jit__lambda was damaged"]
+    assert start() == [f"compiled again: the entry of jit__lambda in {xla_cache} was damaged"]
     assert entries() == []
     assert other.exists()
     assert start() == []

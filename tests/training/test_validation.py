@@ -132,7 +132,7 @@ def test_the_best_validated_policy_of_a_seed_is_found(folder: RunFolder, add: An
     damaged.write_bytes(damaged.read_bytes()[:-1])
     assert best() == 10_000
     [line] = lines
-    assert line.startswith(f"not chosen from: {damaged} is damaged")
+    assert line.startswith(f"validated policy left out: {damaged} is damaged")
 
 
 @pytest.fixture
@@ -156,7 +156,7 @@ def test_the_run_exports_its_last_policy_or_its_best(
     assert display.lines == []
     assert load_policy(folder.policy).manifest["training"]["env_steps"] == 64
     assert exported("best", 7.0) == [pytest.approx(1_000)]
-    assert display.lines == [f"seed {SEED}: of 1000 decisions, the best by validation"]
+    assert display.lines == [f"seed {SEED}: policy after 1000 decisions, the best by validation"]
     best = folder.validated_policy(SEED, 1_000)
     assert folder.policy.read_bytes() == best.read_bytes()
 
