@@ -62,7 +62,7 @@ format: $(DEV)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) site demo/dist demo/node_modules mjx_balance/page
+	rm -rf $(VENV) site jupyter_execute demo/dist demo/node_modules mjx_balance/page
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

@@ -20,11 +20,18 @@ with quiet_imports("torch", "warp"):  # MJX prints that it finds no Warp
 
 project = html_title = "mjx_balance"
 author, copyright = "the authors of mjx_balance", "the authors of mjx_balance, Apache-2.0"
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "myst_parser"]
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "myst_nb"]
 exclude_patterns = ["_build"]
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
+
+# The notebook is in git without outputs. A build of its page runs it, and fails if a cell does.
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 1_800  # s, of a cell, on a busy machine
+nb_output_stderr = "remove"  # JAX's and MuJoCo's remarks on the machine
+nb_merge_streams = True
 
 # The docstrings are Google's, with names in single backticks: a link where there is something to
 # link to, code where there is not.

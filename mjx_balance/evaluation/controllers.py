@@ -26,15 +26,15 @@ SWEEPS = 25  #: rounds of coordinate descent of the predictive controllers
 class View(NamedTuple):
     """What n scenarios of an evaluation show before a decision; a policy looks at `obs` alone."""
 
-    scene: Scene  # in which the addresses in qpos and qvel hold
-    ids: np.ndarray  # (n,) numbers of these scenarios in the batch, for controllers with a memory
-    env_steps: int  # decisions since the start
-    obs: np.ndarray  # (n, obs_size) the network's input
-    imu: np.ndarray  # (n, sim_steps, 6) IMU samples of the last decision
-    qpos: np.ndarray  # (n, nq) true positions
-    qvel: np.ndarray  # (n, nv) true velocities
-    scenario: tilt.Scenario  # where the boards go
-    delayed: np.ndarray  # (n,) whether actions are taken one decision later
+    scene: Scene  #: in which the addresses in qpos and qvel hold
+    ids: np.ndarray  #: (n,) numbers of these scenarios in the batch, for controllers with a memory
+    env_steps: int  #: decisions since the start
+    obs: np.ndarray  #: (n, obs_size) the network's input
+    imu: np.ndarray  #: (n, sim_steps, 6) IMU samples of the last decision
+    qpos: np.ndarray  #: (n, nq) true positions
+    qvel: np.ndarray  #: (n, nv) true velocities
+    scenario: tilt.Scenario  #: where the boards go
+    delayed: np.ndarray  #: (n,) whether actions are taken one decision later
 
 
 Controller = Callable[[View], np.ndarray]  #: action indices (n,), or a_x and a_y (n, 2), m
