@@ -52,7 +52,7 @@ EM = 14.5  # a little larger than the text around it, whose letters are wide
 ziamath.config.svg2 = False  # no symbols with ids, which all equations of a page would share
 html_copy_source = False
 html_show_sphinx = False
-pygments_style, pygments_dark_style = "friendly", "monokai"
+pygments_style, pygments_dark_style = "a11y-high-contrast-light", "a11y-high-contrast-dark"
 
 LINKS = {
     "../benchmarks/README.md": "results.md",
