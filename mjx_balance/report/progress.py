@@ -97,7 +97,9 @@ class Display:
 
     def __init__(self, console: Console | None = None):
         """Writes to `console`; to standard output if None."""
-        self.console = console or Console(file=cast(TextIO, _Output(sys.stdout)))
+        # In a notebook, rich would make an HTML block of every line.
+        stream = cast(TextIO, _Output(sys.stdout))
+        self.console = console or Console(file=stream, force_jupyter=False)
         self._spinner = "line" if self.console.options.ascii_only else "dots"
         self._metrics: Mapping[str, float] = {}
 

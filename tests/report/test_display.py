@@ -273,3 +273,12 @@ def test_a_run_outlives_the_reader_of_its_lines(kind: str) -> None:
     os.close(reader)
     assert process.communicate(b"go on\n", timeout=60) == (None, b"")
     assert process.returncode == 7
+
+
+def test_a_notebook_gets_plain_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On its standard output, not as an HTML block each."""
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    Display().say("learning")
+    assert capsys.readouterr().out == "learning\n"
