@@ -32,9 +32,11 @@ def main() -> None:
         for name, own, controller in columns:
             result = common.evaluated(own, controller, suite, args.scenarios)
             rows[-1][name] = common.pooled([result])
+    fell = any(row[name]["falls"] for row in rows for name, *_ in columns)
+    falls = "falls in brackets, none elsewhere" if fell else "no falls"
     note = (
         f"{common.TILTS.capitalize()}, over {args.scenarios} held-out scenarios of "
-        f"{common.DURATION:g} s; falls in brackets, none elsewhere."
+        f"{common.DURATION:g} s; {falls}."
     )
     common.report(args, "suites", rows, note)
 
