@@ -76,7 +76,7 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=makers())
     parser.add_argument("--policies", type=Path, default=REPO / "policies" / "robots")
     parser.add_argument("--preset", default="real")
-    parser.add_argument("--decisions", type=int, default=120_000)
+    parser.add_argument("--decisions", type=int, default=300_000)
     parser.add_argument("--scenarios", type=int, default=256, help="a quarter of it in push")
     args = parser.parse_args()
     policies = {robot: trained(robot, args) for robot in args.robots}
