@@ -83,14 +83,16 @@ def machine() -> str:
     return f"{found['cpu']}, {found['cores']} cores"
 
 
-def evaluated(scene: Any, controller: Any, suite: str, scenarios: int) -> Row:
+def evaluated(
+    scene: Any, controller: Any, suite: str, scenarios: int, duration: float = DURATION
+) -> Row:
     """A controller's `summarize`d evaluation on held-out scenarios, plain MuJoCo."""
     from mjx_balance.evaluation.rollout import run_suite, summarize
     from mjx_balance.evaluation.suites import SEEDS
 
     seed = SEEDS.held_out
-    rollout = run_suite(scene, controller, suite, scenarios, DURATION, seed)
-    return summarize(rollout, suite, DURATION, seed)
+    rollout = run_suite(scene, controller, suite, scenarios, duration, seed)
+    return summarize(rollout, suite, duration, seed)
 
 
 def evaluated_policies(policies: Sequence[Any], scenarios: int) -> dict[str, Row]:

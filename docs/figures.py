@@ -1,16 +1,19 @@
 """Draws the pictures of these pages from the code that they show: python docs/figures.py [NAME].
 
-decision.svg, radial.svg; balance.webp, which needs an OpenGL backend (EGL or OSMesa).
+decision.svg, radial.svg; peers.svg, from what benchmarks/peers.py has measured; balance.webp, which
+needs an OpenGL backend (EGL or OSMesa).
 """
 
 import contextlib
 import itertools
+import json
 import sys
 from pathlib import Path
 
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullLocator
 from PIL import Image, ImageDraw, ImageFont
 
 from mjx_balance import load_policy
@@ -78,6 +81,54 @@ def radial() -> plt.Figure:
     return figure
 
 
+OURS = ("quick", "quick-16k", "default")
+COLOURS = {"rejax": RED, "brax": figures.GREEN, "sb3": figures.PURPLE}
+DASHES = {"dqn": "-", "pqn": (0, (1, 1)), "sac": (0, (5, 1, 1, 1)), "ppo": (0, (4, 1.5))}
+
+
+def peers() -> plt.Figure:
+    """Tilt over time of our learner and of others: median and extremes of the seeds."""
+    rows = json.loads((HERE.parent / "benchmarks" / "peers.json").read_text())["rows"]
+    figure, axes = plt.subplots(1, 3, figsize=(12, 4.6), sharey=True)
+    names = [x for x in dict.fromkeys(row["contender"] for row in rows) if "-" in x or x in OURS]
+    names = [x for x in names if x in OURS or x.split("-")[0] in COLOURS]
+    for axis, suite in zip(axes, ("paper", "corner", "push"), strict=True):
+        axis.set(xscale="log", yscale="log", title=suite, xlabel="s from the start of the process")
+        labels = []
+        for name in names:
+            colour = COLOURS.get(name.split("-")[0], BLUE)
+            dashes = DASHES.get(name.split("-")[-1], "-")
+            runs = [row["points"] for row in rows if row["contender"] == name]
+            low = max(points[0]["seconds"] for points in runs)
+            high = min(points[-1]["seconds"] for points in runs)
+            time = np.geomspace(low, high, 40)
+            curves = [
+                np.exp(
+                    np.interp(
+                        np.log(time),
+                        np.log([x["seconds"] for x in points]),
+                        np.log([x[suite]["mean"] for x in points]),
+                    )
+                )
+                for points in runs
+            ]
+            middle = np.median(curves, axis=0)
+            band = np.min(curves, axis=0), np.max(curves, axis=0)
+            axis.fill_between(time, *band, color=colour, alpha=0.15, lw=0)
+            axis.plot(time, middle, color=colour, ls=dashes, lw=2.2 if name in OURS else 1.3)
+            library, _, algorithm = name.partition("-")
+            text = f"ours, {name}" if name in OURS else f"{library} {algorithm.upper()}"
+            labels.append((text, colour, time[-1], middle[-1]))
+        axis.set_xticks((5, 10, 20, 40, 60), ("5", "10", "20", "40", "60"))
+        axis.xaxis.set_minor_locator(NullLocator())
+        axis.yaxis.set_major_formatter("{x:g}")
+        if axis is axes[-1]:
+            figure.tight_layout()
+            figures.label_right(axis, labels)
+    axes[0].set_ylabel("mean tilt [deg]")
+    return figure
+
+
 ANIMATION_FPS, ANIMATION_S, ANIMATION_SIZE = 10, 14.0, (400, 300)
 
 
@@ -139,11 +190,11 @@ def labelled(picture: np.ndarray, name: str, fallen: bool) -> np.ndarray:
 
 def main() -> None:
     """Draws the named pictures, or all."""
-    names = sys.argv[1:] or ["decision", "radial", "balance"]
+    names = sys.argv[1:] or ["decision", "radial", "peers", "balance"]
     with matplotlib.rc_context(STYLE):
         if "balance" in names:
             balance()
-        for draw in (decision, radial):
+        for draw in (decision, radial, peers):
             if draw.__name__ in names:
                 figure = draw()
                 figure.tight_layout()

@@ -53,6 +53,7 @@ SAC = {
     "num_eval_envs": 1,
 }
 BOTH = {"learning_rate": 1e-3, "discounting": 0.1, "normalize_observations": True}  # the paper's
+EPOCH = 2_048  #: decisions that a call of PPO's compiled program takes at least
 TRAINERS = {"ppo": (ppo.train, PPO), "sac": (sac.train, SAC)}
 
 

