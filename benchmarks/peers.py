@@ -216,14 +216,16 @@ def peer(args: argparse.Namespace) -> None:
     clock = Clock(args.began, args.seconds, PEERS[args.peer])
     with contextlib.redirect_stdout(sys.stderr):
         scene = LIBRARIES[library](name, args.seed, clock)
-        rows = evaluated(scene, clock.points, args.scenarios)
+        rows = evaluated(scene, clock.points, args.scenarios, args.coarse)
     args.json.write_text(json.dumps(rows))
 
 
-def evaluated(scene: Scene, points: Sequence[Point], scenarios: int) -> list[Row]:
+def evaluated(
+    scene: Scene, points: Sequence[Point], scenarios: int, coarse: int = COARSE
+) -> list[Row]:
     """The points with their evaluations, as JSON.
 
-    One in `COARSE` of them and the last; before the first that balances, those in between, too.
+    One in `coarse` of them and the last; before the first that balances, those in between, too.
     """
     rows: dict[int, Row] = {}
 
@@ -235,7 +237,7 @@ def evaluated(scene: Scene, points: Sequence[Point], scenarios: int) -> list[Row
             common.log(f"{seconds:7.1f} s {decisions:9,} {tilts}")
 
     last = len(points) - 1
-    add(sorted({*range(last, -1, -COARSE)}))
+    add(sorted(range(last, -1, -coarse)))
     known = sorted(rows)
     for before, after in itertools.pairwise(known):
         if balances(rows[after]) and not balances(rows[before]):
@@ -255,14 +257,17 @@ def balances(point: Row) -> bool:
     return all(point[suite]["mean"] <= most for suite, most in BALANCED.items())
 
 
-def run_peer(name: str, seed: int, args: argparse.Namespace, work: Path) -> list[Row]:
-    """The points of a peer in a process of its own.
+def run_peer(
+    name: str, seed: int, args: argparse.Namespace, work: Path, coarse: int = COARSE
+) -> list[Row]:
+    """The points of a peer in a process of its own; one in `coarse` of its policies is evaluated.
 
     Raises:
       ContenderError: if it fails.
     """
     file = work / f"{name}-{seed}.json"
     flags = {"seed": seed, "seconds": args.seconds, "scenarios": args.scenarios, "json": file}
+    flags["coarse"] = coarse
     command = [sys.executable, __file__, "--peer", name]
     command += [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]
     run([*command, "--began", str(time.time())])
@@ -371,6 +376,7 @@ def main() -> int:
     parser.add_argument("--scenarios", type=int, default=16, help="of each suite")
     parser.add_argument("--peer", choices=PEERS, help=argparse.SUPPRESS)  # in its own process
     parser.add_argument("--seed", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--coarse", type=int, default=COARSE, help=argparse.SUPPRESS)
     parser.add_argument("--began", type=float, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.peer:

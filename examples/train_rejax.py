@@ -48,7 +48,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "batch_size": 256,
         "polyak": 0.95,
         "normalize_observations": True,
-        "normalize_rewards": True,
+        "reward_scale": 30.0,  # against an entropy whose weight begins at 1
     },
     "ppo": {
         "num_envs": 64,
@@ -76,8 +76,9 @@ class GymnaxEnv:
 
     default_params = None
 
-    def __init__(self, env: BalanceEnv):
-        self.env = env
+    def __init__(self, env: BalanceEnv, reward_scale: float = 1.0):
+        """Takes an env of either action; rewards are multiplied by `reward_scale`."""
+        self.env, self.reward_scale = env, reward_scale
 
     def reset(self, key: jax.Array, params: Any = None) -> tuple[Any, State]:
         """Observation and state of an episode; the first ones do not all end at once."""
@@ -92,7 +93,7 @@ class GymnaxEnv:
         over = after.done > 0
         state = jax.tree.map(lambda new, old: jnp.where(over, new, old), start, after)
         fell = over & (after.info["truncation"] == 0)
-        return state.obs, state, after.reward, fell, {}
+        return state.obs, state, self.reward_scale * after.reward, fell, {}
 
     def action_space(self, params: Any = None) -> Any:
         """441 actions, or two shares."""
@@ -125,7 +126,8 @@ def make(algorithm: str, env: BalanceEnv, decisions: int, **more: Any) -> Any:
     learning_rate: float = options["learning_rate"]
     options["learning_rate"] = optax.linear_schedule(learning_rate, 0.0, int(updates))
     widths = options.pop("widths", WIDTHS.get(algorithm))
-    learner = rejax.get_algo(algorithm).create(env=GymnaxEnv(env), **options)
+    adapter = GymnaxEnv(env, options.pop("reward_scale", 1.0))
+    learner = rejax.get_algo(algorithm).create(env=adapter, **options)
     if widths:
         learner = learner.replace(agent=learner.agent.clone(hidden_layer_sizes=widths))
     return learner

@@ -35,6 +35,8 @@ SMALLEST = {
     "peers.py --contenders brax-ppo brax-sac --seeds 0 --seconds 20 --scenarios 1": "| brax-sac |",
     "peers.py --contenders rejax-dqn --seeds 0 --seconds 20 --scenarios 1": "| rejax-dqn | 1 |",
     "peers.py --contenders sb3-dqn --seeds 0 --seconds 20 --scenarios 1": "| sb3-dqn | 1 |",
+    "time_to_balance.py --contenders mujoco --decisions 640 --scenarios 2": "| mujoco | warm |",
+    "time_to_balance.py --contenders sb3 --seconds 20 --scenarios 2": "| sb3 | cold |",
     "accelerator.py --budget 400 --engines mujoco --sizes 64": "`train.py --engine mujoco`, warm",
     "fidelity.py --scenarios 2 --periods 1": "| latency |",
     "fidelity.py --table contact --scenarios 1": "| foot friction 0.4 |",
@@ -60,6 +62,7 @@ ENGINE_KEYS = {
     *("physics_steps_per_second", "decisions_per_second", "env_over_batch", "training_over_batch"),
     *("peak_host_memory_mib", "peak_device_memory_mib"),
 }
+CONTENDER_KEYS = {"contender", "engine", "start", "seconds", "decisions", "paper", "corner"}
 
 
 @pytest.mark.long
@@ -85,6 +88,9 @@ def test_it_runs(command: str, tmp_path: Path) -> None:
         if script == "throughput.py" and "--table" not in flags:
             assert row.keys() == ENGINE_KEYS
             assert row["decisions_per_second"].keys() == {"env", "training", "batch"}
+        if script == "time_to_balance.py":
+            assert row.keys() == CONTENDER_KEYS
+            assert row["paper"].keys() == row["corner"].keys() == {"mean", "falls"}
         if script == "peers.py":
             assert len(row["points"]) > 1
 
@@ -374,6 +380,141 @@ def test_runs_stay_when_a_contender_fails_and_are_not_repeated(
         assert row["points"] == [point(9.0, 0.09, 0.1)]
         assert "| quick | 1 | - | 9 |" in capsys.readouterr().out
     assert begun == ["quick", "default", "default"]
+    assert not page.exists()
+
+
+@pytest.fixture
+def timing(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """`benchmarks/time_to_balance.py`; a look at its clock takes a second, an evaluation 100."""
+    module = load("time_to_balance", monkeypatch)
+    module.now = 0.0
+
+    def look() -> float:
+        module.now += 1
+        return module.now
+
+    def later(result: Any) -> Any:
+        module.now += 100
+        return result
+
+    results = {"paper": {"mean": 0.1, "falls": 0}, "corner": {"mean": 3.0, "falls": 0}}
+    clock = types.SimpleNamespace(perf_counter=look, sleep=lambda seconds: None)
+    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(module.common, "evaluated_policies", lambda *_: later(results))
+    return module
+
+
+def test_the_peers_time_is_that_of_the_first_policy_that_passes(
+    timing: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = [point(3.0, 0.1, 3.0), point(4.0, 0.21, 3.0), point(5.0, 0.2, 3.0), point(6.0, 0.1, 1)]
+    points[0]["paper"]["falls"] = 1
+    asked = []
+
+    def run_peer(name: str, *more: Any, coarse: int) -> list[dict[str, Any]]:
+        asked.append((name, coarse))
+        return points
+
+    monkeypatch.setattr(timing.peers, "run_peer", run_peer)
+    args = types.SimpleNamespace(threshold=0.2, scenarios=1)
+    assert timing.peer_row("sb3", args, tmp_path) == {
+        "contender": "sb3",
+        "engine": "mujoco",
+        "start": "cold",
+        "seconds": 5.0,
+        "decisions": 500,
+        "paper": {"mean": 0.2, "falls": 0},
+        "corner": {"mean": 3.0, "falls": 0},
+    }
+    assert asked == [("sb3-dqn", 1)]
+    args.threshold = 0.01
+    never = timing.peer_row("sb3", args, tmp_path)
+    assert (never["seconds"], never["decisions"]) == (None, 600)
+
+
+def test_our_clock_stops_when_the_policy_is_there(timing: types.ModuleType, tmp_path: Path) -> None:
+    part, file = str(tmp_path / "part"), tmp_path / "file"
+    script = f"import os, pathlib, time; p = pathlib.Path({part!r});"
+    script += "p.write_text(os.environ['MJX_BALANCE_CACHE']);"
+    script += f"p.rename({str(file)!r}); time.sleep(600)"
+    assert timing.time_to_file([sys.executable, "-c", script], file, tmp_path) == 1
+    assert file.read_text() == str(tmp_path)
+    with pytest.raises(timing.ContenderError, match="exit code 3"):
+        timing.time_to_file([sys.executable, "-c", "exit(3)"], tmp_path / "none", tmp_path)
+
+
+def test_a_warm_start_is_the_same_again(
+    timing: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = REPO / "policies" / "best.safetensors"
+    asked = []
+
+    def time_to_file(command: list[str], file: Path, cache: Path) -> float:
+        asked.append((" ".join(command[1:-1]), cache, cache.exists()))
+        cache.mkdir(exist_ok=True)
+        file.parent.mkdir()
+        file.write_bytes(shipped.read_bytes())
+        return 30.0 - 10 * len(asked)
+
+    monkeypatch.setattr(timing, "time_to_file", time_to_file)
+    args = types.SimpleNamespace(decisions=640, scenarios=1)
+    rows = [row for x in ("mjx", "mujoco") for row in timing.train_rows(x, args, tmp_path)]
+    starts = ("mjx cold", "mjx warm", "mujoco cold", "mujoco warm")
+    assert tuple(f"{row['engine']} {row['start']}" for row in rows) == starts
+    assert [existed for _, _, existed in asked] == [False, True, False, True]
+    assert asked[0] == (*asked[1][:2], False)
+    assert "train.py --preset quick --engine mjx --num-env-steps 640 --run-dir" in asked[0][0]
+    assert rows[0]["seconds"] == 20.0
+    assert rows[0]["decisions"] == load_policy(shipped).manifest["training"]["env_steps"]
+    assert rows[0]["paper"] == {"mean": 0.1, "falls": 0}
+
+
+def test_the_ratio_is_the_peers_time_over_ours(timing: types.ModuleType) -> None:
+    tilts = {"paper": {"mean": 0.1, "falls": 0}, "corner": {"mean": 0.25, "falls": 7}}
+    mine = {"contender": "mujoco", "start": "warm", "seconds": 24.0, "decisions": 20224} | tilts
+    other = {"contender": "sb3", "start": "cold", "seconds": 300.0, "decisions": 75000} | tilts
+    line = timing.table_lines([mine, other], 64, 0.2)[2]
+    assert line == "| mujoco | warm | 24.0 | 20,224 | 0.100 | 0.250 (7 fall) | 12.5 |"
+    for rows in ([mine], [mine, other | {"seconds": None}]):
+        assert timing.table_lines(rows, 64, 0.2)[2].endswith(" | - |")
+
+
+def test_without_the_peer_nothing_is_started(
+    timing: types.ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(timing.importlib.util, "find_spec", lambda name: None)
+    for flags in ([], ["--contenders", "sb3"]):
+        monkeypatch.setattr(sys, "argv", ["time_to_balance.py", *flags])
+        assert timing.main() == 2
+        message = capsys.readouterr().err
+        assert message.count("\n") == 1
+        assert "--contenders mujoco mjx" in message
+
+
+def test_rows_stay_when_a_contender_fails(
+    timing: types.ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    row = {"contender": "mujoco", "start": "cold", "seconds": 24.0, "decisions": 20224}
+    row |= {"paper": {"mean": 0.1, "falls": 0}, "corner": {"mean": 0.2, "falls": 0}}
+    ends: list[BaseException] = [KeyboardInterrupt(), timing.ContenderError("mjx gave up")]
+
+    def train_rows(engine: str, *more: Any):
+        if engine == "mjx":
+            raise ends.pop()
+        yield row
+
+    file, page = tmp_path / "t.json", tmp_path / "page.md"
+    monkeypatch.setattr(timing, "train_rows", train_rows)
+    flags = f"--contenders mujoco mjx --json {file} --write {page}".split()
+    monkeypatch.setattr(sys, "argv", ["time_to_balance.py", *flags])
+    for code in (2, 130):
+        file.unlink(missing_ok=True)
+        assert timing.main() == code
+        assert json.loads(file.read_text())["rows"] == [row]
+        assert "| 24.0 |" in capsys.readouterr().out
     assert not page.exists()
 
 
