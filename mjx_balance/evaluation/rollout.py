@@ -149,7 +149,7 @@ def _record(
     rollout.action_mm[ids, number] = 1000 * np.abs(change).mean(axis=-1)
     if rollout.qpos is not None:
         rollout.qpos[ids, span] = path
-        rollout.qpos[ids, span.stop :] = path[:, -1:]
+        rollout.qpos[ids[fallen], span.stop :] = path[fallen, -1:]
 
 
 def summarize(rollout: Rollout, suite: str | Suite, duration: float, seed: int) -> dict[str, Any]:
