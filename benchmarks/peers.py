@@ -179,6 +179,8 @@ def run_brax(name: str, seed: int, clock: Clock) -> Scene:
     acting.Evaluator = Keeper  # pyright: ignore[reportAttributeAccessIssue]
     epochs = clock.decisions // example["EPOCH"]
     more = {"num_evals": 1 + epochs, "deterministic_eval": True, "progress_fn": progress_fn}
+    if name == "ppo":
+        more["run_evals"] = True  # by `Keeper`
     with contextlib.suppress(OutOfTime):
         example["train"](name, env, clock.decisions, seed, **more)
     return env.scene
