@@ -1,6 +1,8 @@
 """`mjx-balance train` and `mjx-balance sweep`."""
 
+import atexit
 import dataclasses
+import gc
 import os
 from pathlib import Path
 
@@ -70,6 +72,10 @@ def train(argv: list[str]) -> int:
         )
     except ValueError as error:  # JAX's own, for what it reads from variables
         return complain(f"JAX cannot be imported: {shorten(error, MESSAGE)}")
+    # JAX is a million objects. Looking through them for garbage takes a second when compiling, and
+    # another one at the exit.
+    gc.freeze()
+    atexit.register(gc.freeze)
     return _train(args)
 
 

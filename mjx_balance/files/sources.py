@@ -1,4 +1,4 @@
-"""The source code that a module depends on: its own, and that of its imports in this package."""
+"""The source code that modules depend on: their own, and that of their imports in this package."""
 
 import ast
 from pathlib import Path
@@ -6,18 +6,18 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def code(module: str, package: Path = PACKAGE) -> dict[str, str]:
-    """Collects a module and all that it imports from this package, directly or indirectly.
+def code(*of: str, package: Path = PACKAGE) -> dict[str, str]:
+    """Collects modules and all that they import from this package, directly or indirectly.
 
     Args:
-      module: full dotted name.
+      of: full dotted names.
       package: folder of mjx_balance.
 
     Returns:
       {module: code}, without comments and docstrings.
     """
     modules: dict[str, str] = {}
-    names = [module]
+    names = list(of)
     while names:
         name = names.pop()
         root, *parts = name.split(".")

@@ -135,7 +135,7 @@ def versions() -> dict[str, str | None]:
 def traced_code(config: Config, root: str) -> list[tuple[str, str]]:
     """Modules and code of `root`, of the config's engine, and of all that they import."""
     module = ENGINES[config.engine].make.partition(":")[0]
-    return sorted((code(root) | code(f"mjx_balance.sim.engines.{module}")).items())
+    return sorted(code(root, f"mjx_balance.sim.engines.{module}").items())
 
 
 def program_key(config: Config, iterations: int, root: str) -> str:

@@ -259,7 +259,7 @@ def test_other_warnings_are_passed_on() -> None:
 @pytest.fixture
 def same_code(monkeypatch: pytest.MonkeyPatch) -> None:
     """Code counts as the same, which is faster than to read it."""
-    monkeypatch.setattr(program_cache, "code", lambda root: {})
+    monkeypatch.setattr(program_cache, "code", lambda *of: {})
 
 
 def key(config: Config = CONFIG, iterations: int = 16) -> str:
@@ -370,10 +370,10 @@ def test_an_edit_of_what_is_traced_changes_the_key_alone(
     (tmp_path / "scenes").mkdir()
     scene = tmp_path / "scenes" / "robot.xml"
     scene.write_text("<mujoco/>")
-    found = code("mjx_balance.root", package)
+    found = code("mjx_balance.root", package=package)
     names = sorted(name.removeprefix("mjx_balance.") for name in found)
     assert names == ["direct", "inner", "inner.deep", "lazy", "root"]
-    monkeypatch.setattr(program_cache, "code", lambda root: code(root, package))
+    monkeypatch.setattr(program_cache, "code", lambda *of: code(*of, package=package))
     monkeypatch.setattr(program_cache, "scene_dir", lambda: tmp_path / "scenes")
 
     def today() -> str:
