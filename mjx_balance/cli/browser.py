@@ -195,13 +195,13 @@ def _simplify_meshes(spec: mujoco.MjSpec) -> None:
 
 def changes(model: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """The numbers of fields that are others than the model's: {name: [indices, numbers]}."""
-    found = {}
+    differences = {}
     for name, values in fields.items():
         old, new = np.ravel(getattr(model, name)), np.ravel(values)
         where = np.flatnonzero(~np.isclose(old, new, rtol=1e-12, atol=1e-15))
         if len(where):
-            found[name] = [where.tolist(), new[where].tolist()]
-    return found
+            differences[name] = [where.tolist(), new[where].tolist()]
+    return differences
 
 
 def suite_scenarios(scene: Scene, suite: str, seed: int) -> list[dict[str, Any]]:
@@ -210,7 +210,7 @@ def suite_scenarios(scene: Scene, suite: str, seed: int) -> list[dict[str, Any]]
     scenario, start = episodes.scenario, None
     if scenario.start is not None:
         start = scene.start(scenario.start)
-    drawn = []
+    scenarios = []
     for k in range(SCENARIOS):
         data: dict[str, Any] = {
             "targets": scenario.targets[k].tolist(),
@@ -236,11 +236,11 @@ def suite_scenarios(scene: Scene, suite: str, seed: int) -> list[dict[str, Any]]
         if episodes.errors is not None:
             errors = episodes.errors._asdict()
             data["errors"] = {name: np.ravel(values[k]).tolist() for name, values in errors.items()}
-        drawn.append(data)
-    return drawn
+        scenarios.append(data)
+    return scenarios
 
 
-def write_data(folder: Path, shown: Iterable[tuple[Path | None, Scene]], seed: int = 0) -> None:
+def write_data(folder: Path, entries: Iterable[tuple[Path | None, Scene]], seed: int = 0) -> None:
     """Writes what the page shows into `folder/data`: policy files with their scenes, and an index.
 
     Without a file there are the baselines alone. `seed` draws the scenarios.
@@ -248,7 +248,7 @@ def write_data(folder: Path, shown: Iterable[tuple[Path | None, Scene]], seed: i
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
     index: dict[str, Any] = {"policies": [], "robots": {}}
-    for path, scene in shown:
+    for path, scene in entries:
         content = robot_data(scene, seed)
         text = json.dumps(content, separators=(",", ":"))
         # Policies of one robot may have other tasks.

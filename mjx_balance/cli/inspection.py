@@ -93,8 +93,8 @@ def problems(scene: Scene, tilt_test: TiltTest) -> list[str]:
         )
     joint, share = _most_loaded(scene, tilt_test)
     if share >= NO_TORQUE_LEFT:
-        taken = f"{quote(joint)} takes {100 * share:.0f}% of its limit"
-        sentences.append(f"robot {name} has no torque left {place}: {taken}")
+        load = f"{quote(joint)} takes {100 * share:.0f}% of its limit"
+        sentences.append(f"robot {name} has no torque left {place}: {load}")
     return sentences
 
 

@@ -226,8 +226,8 @@ def replay_figure(log: Log, replayed: Replay) -> Figure:
 
     def curves(axis: Any, values: np.ndarray, names: tuple[str, ...], style: str = "-") -> None:
         for column, name, colour in zip(values.T, names, (BLUE, ORANGE, GREY), strict=False):
-            shown = np.where(np.abs(column) < 1e6, column, np.nan)
-            axis.plot(time, shown, style, color=colour, lw=1.0, label=name)
+            finite = np.where(np.abs(column) < 1e6, column, np.nan)
+            axis.plot(time, finite, style, color=colour, lw=1.0, label=name)
         axis.legend(loc="upper right", ncols=4)
 
     curves(axes[0], log["gyro"], ("x", "y", "z"))

@@ -129,9 +129,9 @@ def read_manifest(manifest: Any) -> tuple[Config, Robot]:
     if "leg_trim_rad" in manifest:
         parse(TRIMS, manifest["leg_trim_rad"], PolicyError, name="leg_trim_rad")
     # The first files of format 5 do not say what kind of action they have, nor a command delay.
-    given = {"action": "grid"} | manifest | {"robot": to_dict(robot)}
+    parts = {"action": "grid"} | manifest | {"robot": to_dict(robot)}
     for part, expected in describe(config, robot).items():
-        if given.get(part) != expected:
+        if parts.get(part) != expected:
             raise PolicyError(f"its {part} is not what its own config gives")
     return config, robot
 
@@ -149,8 +149,8 @@ def upgrade(manifest: Any) -> Any:
     if (manifest.get("format"), manifest.get("version")) != (FORMAT, CONVERTIBLE):
         return manifest
     parts = describe(*_config_and_robot(manifest)) | {"version": FORMAT_VERSION}
-    kept = ("format", "config", "scene_hash", "versions", "training")
-    return {name: manifest[name] for name in kept} | parts
+    same = ("format", "config", "scene_hash", "versions", "training")
+    return {name: manifest[name] for name in same} | parts
 
 
 def _config_and_robot(manifest: Mapping[str, Any]) -> tuple[Config, Robot]:

@@ -95,9 +95,9 @@ def print_summary(
     folder = RunFolder(run_dir)
     flag = "" if robot in shipped() else f" --robot {shell(Path(robot))}"
     print_table(console, evaluation_table(results))
-    shown = shorten(nearby(run_dir), PATH)
+    folder_name = shorten(nearby(run_dir), PATH)
     # One name a line, so that nothing wraps at 80 columns.
-    console.print(f"{escape(shown)}/", highlight=False, soft_wrap=True)
+    console.print(f"{escape(folder_name)}/", highlight=False, soft_wrap=True)
     for path, what in (
         (folder.policy, f"the policy; `mjx-balance evaluate{escape(flag)}` runs it"),
         (folder.evaluation, "the table above"),

@@ -291,11 +291,11 @@ def _keep_inertia(spec: mujoco.MjSpec, trunk: mujoco.MjsBody) -> list[str]:
     by_geoms = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     bounds = compiler.boundmass > 0 or compiler.boundinertia > 0
     changed = compiler.settotalmass > 0 or bounds or compiler.balanceinertia
-    asked = [b for b in bodies if by_geoms or changed or not b.explicitinertial]
+    derived = [b for b in bodies if by_geoms or changed or not b.explicitinertial]
     by_volume = ""
-    if changed or any(geom.mass != 0 for body in asked for geom in body.geoms):
+    if changed or any(geom.mass != 0 for body in derived for geom in body.geoms):
         model = compile_model(spec)
-        weighed = [body for body in asked if model.body_mass[body.id]]
+        weighed = [body for body in derived if model.body_mass[body.id]]
         by_volume = ", ".join(
             body.name
             for body in weighed

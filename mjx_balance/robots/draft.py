@@ -305,9 +305,9 @@ def _corners(
     axes = [turn @ data.xaxis[leg.joints[0]] for leg in legs]
     forward = int(np.argmax(np.abs(axes).sum(axis=0)[:2]))
     hips -= np.mean(hips, axis=0)
-    said = [_said_end(model.joint(leg.joints[0]).name) for leg in legs]
-    behind = ["hind" if hip[forward] > 0 else "front" for hip in hips]
-    backward = said == behind
+    by_name = [_said_end(model.joint(leg.joints[0]).name) for leg in legs]
+    by_place = ["hind" if hip[forward] > 0 else "front" for hip in hips]
+    backward = by_name == by_place
     if backward:
         hips[:, :2] *= -1
     corners: dict[str, _Leg] = {}

@@ -239,10 +239,10 @@ def _check_text(path: Path) -> None:
                         f"most {MAX_PIXELS}"
                     )
             elif tag == "mesh":
-                made = max(_integers(values["params"]), default=0)
-                if values["builtin"] and made > MAX_PARAMETER:
+                largest = max(_integers(values["params"]), default=0)
+                if values["builtin"] and largest > MAX_PARAMETER:
                     raise RobotError(
-                        f"{path.name} has a mesh with parameter {made:g}; it must be at most "
+                        f"{path.name} has a mesh with parameter {largest:g}; it must be at most "
                         f"{MAX_PARAMETER}"
                     )
             else:

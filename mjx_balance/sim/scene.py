@@ -479,9 +479,9 @@ def _what_to_leave_out(layout: Layout) -> str:
     """Which numbers of the file to leave to the rules."""
     file = robot_file(layout.robot_source)
     names = ("servo_stiffness", "servo_damping", "servo_armature", "body_height")
-    given = [name for name in names if getattr(file, name) is not None]
-    if given:
-        return f"leave out {', '.join(given)} of its file, and the rules give others"
+    own = [name for name in names if getattr(file, name) is not None]
+    if own:
+        return f"leave out {', '.join(own)} of its file, and the rules give others"
     return "neither its centre of mass nor its file says why; look at its picture"
 
 

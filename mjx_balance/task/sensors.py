@@ -144,15 +144,15 @@ def sense(
     stream = xp.concatenate((memory.trail, measured), axis=-2)
     number = np.arange(count, dtype=np.int32)
     age = late_steps(task, errors, draws, IMU).astype(np.int32)
-    seen = _take(stream, count + number - age[..., None])
+    samples = _take(stream, count + number - age[..., None])
     new = xp.where(draws.lost < errors.dropout[..., None], 0, number + 1)
-    seen = _take(
-        xp.concatenate((last[..., None, :], seen), axis=-2), xp.maximum.accumulate(new, axis=-1)
+    samples = _take(
+        xp.concatenate((last[..., None, :], samples), axis=-2), xp.maximum.accumulate(new, axis=-1)
     )
     grown = memory.drift + errors.drift * np.sqrt(task.ctrl_dt).astype(imu.dtype) * draws.drift
     # A diverged env gives no numbers: it has fallen, and is reset.
     trail = xp.where(abs(measured) < np.inf, measured, 0.0)
-    return SensorMemory(grown, trail), seen
+    return SensorMemory(grown, trail), samples
 
 
 def late_steps(
