@@ -76,17 +76,18 @@ OURS = {
     "quick-mjx-warm": Ours("quick", "mjx", warm=True),
 }
 PEERS = {
-    "rejax-dqn": 60_000,
-    "rejax-pqn": 120_000,
-    "rejax-sac": 60_000,
-    "rejax-ppo": 120_000,
+    "rejax-dqn": 32_000,
+    "rejax-pqn": 48_000,
+    "rejax-sac": 42_000,
+    "rejax-ppo": 56_000,
     "brax-sac": 1_000_000,
     "brax-ppo": 1_000_000,
-    "sb3-dqn": 30_000,
-    "sb3-ppo": 60_000,
+    "sb3-dqn": 15_000,
+    "sb3-ppo": 45_000,
 }
-"""Contender -> decisions, by which the schedules of rejax and stable-baselines3 end: about what two
-cores make in a minute. brax's know none, and the clock stops them."""
+"""Contender -> decisions per minute of its run, about what two cores make: then the schedules of
+rejax and stable-baselines3 end when the clock does. brax's know no end, and the clock stops
+them."""
 PACKAGES = {"rejax": "rejax", "brax": "brax", "sb3": "stable_baselines3"}
 USUAL = ["quick", "quick-16k", "default", *PEERS]
 """Contenders unless others are asked for."""
@@ -215,7 +216,8 @@ LIBRARIES = {"rejax": run_rejax, "brax": run_brax, "sb3": run_sb3}
 def peer(args: argparse.Namespace) -> None:
     """Runs a peer in this process, evaluates what it has kept, and writes the points."""
     library, name = args.peer.split("-")
-    clock = Clock(args.began, args.seconds, PEERS[args.peer])
+    decisions = round(PEERS[args.peer] * args.seconds / 60)
+    clock = Clock(args.began, args.seconds, decisions)
     with contextlib.redirect_stdout(sys.stderr):
         scene = LIBRARIES[library](name, args.seed, clock)
         rows = evaluated(scene, clock.points, args.scenarios, args.coarse)
@@ -374,7 +376,7 @@ def main() -> int:
     parser = common.arguments(__doc__)
     parser.add_argument("--contenders", nargs="*", default=USUAL, choices=(*OURS, *PEERS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--seconds", type=float, default=60.0, help="of a peer's run")
+    parser.add_argument("--seconds", type=float, default=150.0, help="of a peer's run")
     parser.add_argument("--scenarios", type=int, default=16, help="of each suite")
     parser.add_argument("--peer", choices=PEERS, help=argparse.SUPPRESS)  # in its own process
     parser.add_argument("--seed", type=int, help=argparse.SUPPRESS)
