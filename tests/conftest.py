@@ -17,11 +17,16 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from mjx_balance.config import Config, preset
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.sim.scene import Scene, load_scene
 
+# The same examples in every run: what fails here fails everywhere. `--hypothesis-profile=default`
+# draws others.
+settings.register_profile("repeatable", derandomize=True)
+settings.load_profile("repeatable")
 pytest_plugins = ("fixtures.bodies", "fixtures.fleet", "fixtures.headers")
 
 jax.config.update("jax_num_cpu_devices", 2)

@@ -132,6 +132,7 @@ def test_the_reader_tilts_pushes_and_switches_off(browser: Browser, address: str
     """The board goes where keys and disc say; a push shows; off holds; a new start balances."""
     browser.open(f"{address}?suite=")
     browser.wait(READY)
+    browser.run("Math.random = () => 0.1")  # all pushes one way; two opposed ones cancel
     press = "dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowUp'}))"
     browser.run(";".join([press] * 3))
     assert browser.run("document.getElementById('knob').style.top") != "50%"
@@ -158,7 +159,6 @@ def test_the_reader_tilts_pushes_and_switches_off(browser: Browser, address: str
     browser.run("document.getElementById('off').click()")
     browser.wait(READY)
     assert browser.run("document.getElementById('knob').style.left") == "50%"
-    browser.run("Math.random = () => 0.1")  # two pushes one way; two opposed ones cancel
     browser.run("document.getElementById('push-size').value = 1.5")
     browser.run("document.getElementById('push').click(); document.getElementById('push').click()")
     browser.wait("document.getElementById('state').textContent.includes('holding: the ')")
