@@ -26,7 +26,7 @@ from mjx_balance.files.run_folder import write_atomically
 from mjx_balance.files.sources import code
 from mjx_balance.machine import cores
 from mjx_balance.policy.manifest import installed_version
-from mjx_balance.robots.catalogue import robot_xml
+from mjx_balance.robots.catalogue import find_robot, robot_xml
 from mjx_balance.sim.engines import ffi
 from mjx_balance.sim.engines.table import ENGINES
 from mjx_balance.sim.scene import scene_dir
@@ -147,9 +147,11 @@ def program_key(config: Config, iterations: int, root: str) -> str:
       root: module that builds the program; it and its imports are traced.
     """
     values = {k: v for k, v in to_dict(config).items() if k not in NOT_TRACED}
+    robot = to_dict(find_robot(config.robot))  # not all of its numbers are in its model
     devices = [(device.platform, device.device_kind) for device in jax.devices()]
     flags = [str(getattr(jax.config, name)) for name in FLAGS]
-    traced = (values, iterations, devices, cores(), flags, versions(), traced_code(config, root))
+    code_of = traced_code(config, root)
+    traced = (values, robot, iterations, devices, cores(), flags, versions(), code_of)
     key = hashlib.sha256(repr(traced).encode())
     for path in sorted(scene_dir().glob("*.xml")):
         key.update(path.name.encode() + b"\0" + path.read_bytes())

@@ -17,6 +17,8 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_balance.config import Config, preset
 from mjx_balance.files.sources import code
+from mjx_balance.robots import catalogue
+from mjx_balance.robots.catalogue import find_robot, robot_file, use_robot
 from mjx_balance.training import program_cache, sizing
 from mjx_balance.training.program_cache import NOT_TRACED, compile_program, program_key, traced_code
 
@@ -300,6 +302,24 @@ def test_another_model_of_a_robot_changes_the_key(tmp_path: Path, bodies: Any) -
         (tmp_path / "rex.toml").write_text(bodies.file_text(Path("model.xml")))
         keys.add(key(dataclasses.replace(CONFIG, robot=str(tmp_path / "rex.toml"))))
     assert len(keys) == 2
+
+
+@pytest.mark.usefixtures("same_code")
+def test_every_number_of_a_robots_file_changes_the_key(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Delay and friction are in no model of the body, but in the program."""
+    monkeypatch.setattr(catalogue, "_IN_PYTHON", {})
+    numbers = ("foot_friction", "command_delay", "hip_torque", "knee_torque", "servo_stiffness")
+    numbers += ("servo_damping", "servo_armature", "servo_friction", "body_height", "action_max")
+    file = dataclasses.replace(robot_file("quadruped"), name="twin")
+    robot = find_robot("quadruped")
+    others = [{name: 0.9 * getattr(robot, name) + 1e-3} for name in numbers]
+    keys = set()
+    for change in ({}, *others):
+        name = use_robot(dataclasses.replace(file, **change))
+        keys.add(key(dataclasses.replace(CONFIG, robot=name)))
+    assert len(keys) == 1 + len(numbers)
 
 
 @pytest.mark.usefixtures("same_code")
