@@ -74,7 +74,7 @@ def _is_file(robot: str) -> bool:
 def check_same_config(saved: Config, config: Config, path: Path) -> None:
     """Checks that the run in `path`, of config `saved`, is resumed with the same config.
 
-    A robot file may have moved; `check_same_provenance` compares its scene.
+    A robot file may have moved; `check_same_provenance` compares its numbers.
 
     Raises:
       RunFolderError: names the first field that differs.

@@ -127,9 +127,12 @@ def _standing_still(config: Config, env: BalanceEnv) -> dict[str, float]:
 
 def provenance(env: BalanceEnv) -> dict[str, Any]:
     """What decides a run besides its config; a resumed run compares it with its own."""
+    robot = to_dict(env.scene.robot)
+    del robot["name"]  # of a file, which may be renamed
     return {
         "scene_hash": env.scene.hash,
         "engine": env.backend,
+        **{f"robot_{name}": value for name, value in robot.items()},
         "versions": program_cache.versions(),
     }
 

@@ -32,6 +32,7 @@ from mjx_balance.report.progress import Display
 from mjx_balance.report.tables import print_summary
 from mjx_balance.robots.catalogue import SHIPPED as SHIPPED_ROBOTS
 from mjx_balance.robots.catalogue import find_robot
+from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import load_scene, scene_dir
 from mjx_balance.training import run
 from mjx_balance.training.checkpoints import CheckpointError, SaveError
@@ -189,6 +190,20 @@ def test_what_cannot_be_resumed_is_refused(
     assert "another process works on the run in run;" in said
     folder.evaluation.write_text("{}")
     assert "is finished" in refuse(capsys, "train", "--resume", "run")
+
+
+def test_a_run_goes_on_with_its_robot_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, bodies: Any
+) -> None:
+    """A command delay is in no scene."""
+    file, model = tmp_path / "rex.toml", Path("scenes:quadruped.xml")
+    file.write_text(bodies.file_text(model, command_delay=0.01))
+    config = for_robot(SMOKE, str(file))
+    today = run.provenance(BalanceEnv(config))
+    create_run_folder(tmp_path / "run", to_dict(config), today)
+    file.write_text(bodies.file_text(model, command_delay=0.02))
+    said = refuse(capsys, "train", "--resume", "run")
+    assert "was started with robot_command_delay 0.01, but it is 0.02 today" in said
 
 
 @pytest.mark.parametrize(
