@@ -225,9 +225,10 @@ def _draw_held_out(axis: Axes, runs: list[list[dict[str, Any]]]) -> None:
 
 def _seed_curves(run: list[dict[str, Any]], name: str) -> np.ndarray:
     """(seeds, lines) values of a metric; one row if the run logs no seeds, NaN for a gap."""
-    short = name.removeprefix("train/")
-    if run and short in run[0].get("seeds", {}):
-        return np.asarray([m["seeds"][short] for m in run], float).T
+    of_seeds = [m.get("seeds", {}).get(name.removeprefix("train/")) for m in run]
+    count = max((len(values) for values in of_seeds if values), default=0)
+    if count:
+        return np.asarray([values or [None] * count for values in of_seeds], float).T
     return np.asarray([[m.get(name) for m in run]], float)
 
 

@@ -225,7 +225,6 @@ def _metrics_line(text: bytes, before: list[dict[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def _counts(line: dict[str, Any]) -> dict[str, int]:
-    """Number of seeds of each training metric; validations are not in every line."""
-    seeds = line.get("seeds", {})
-    return {name: len(values) for name, values in seeds.items() if name not in HELD_OUT}
+def _counts(line: dict[str, Any]) -> set[int]:
+    """Number of seeds; more than one if metrics differ. Not every metric is in every line."""
+    return {len(values) for values in line.get("seeds", {}).values()}

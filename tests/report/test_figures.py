@@ -89,7 +89,7 @@ def test_learning_curves_leave_out_what_is_no_number_or_no_loss_yet() -> None:
 
 
 def test_a_run_whose_first_lines_have_no_loss_yet_is_drawn() -> None:
-    """No update has been made, as in preset `paper`: the line has no loss, a seed's is null."""
+    """No update has been made, as in preset `paper`: neither a line nor its seeds have a loss."""
     lines = [metrics_line(1_000 * k, [float(k)] * 6) for k in (1, 2, 3)]
     del lines[0]["train/loss"], lines[1]["train/loss"]
     figure = figures.learning_curves([lines])
@@ -98,6 +98,10 @@ def test_a_run_whose_first_lines_have_no_loss_yet_is_drawn() -> None:
     lines[0]["seeds"]["loss"][1] = None
     figure = figures.learning_curves([lines])
     np.testing.assert_allclose(data(figure.axes[3]), [(1, 1), (2, 4)])
+    del lines[0]["train/loss"], lines[0]["seeds"]["loss"]
+    figure = figures.learning_curves([lines])
+    np.testing.assert_allclose(data(figure.axes[3]), [(2, 4)])
+    assert len(figure.axes[3].collections) == 1, "the extremes over the seeds"
 
 
 def test_learning_curves_show_validations_as_points_beside_the_tilt() -> None:
