@@ -206,11 +206,16 @@ def _learn(run: Run, profile: bool) -> list[AnyPolicy]:
         state, seconds = learn(run, program, state, stop, functools.partial(validate, run))
         if isinstance(program, profiling.Profiled) and not program.begun:
             run.display.say(profiling.TOO_SHORT)
-        policies = processes.run_on_all(
-            lambda: finish.export(run, state, seconds) if processes.first else [], PolicyError
-        )
+
+        def export() -> list[AnyPolicy]:
+            with stop.saving(folder.path):
+                return finish.export(run, state, seconds) if processes.first else []
+            return []  # a full disk
+
+        policies = processes.run_on_all(export, PolicyError)
         resume = f"continue with --resume {shell(folder.path)}"
-        so_far = f"the policy so far is {folder.policy}; {resume}" if run.exportable else resume
+        exported = run.exportable and folder.policy.is_file()
+        so_far = f"the policy so far is {folder.policy}; {resume}" if exported else resume
         if failure := next(filter(None, processes.gather(stop.failure)), None):
             raise checkpoints.SaveError(f"{failure}; {so_far}")
         if processes.any(stop.interrupted):

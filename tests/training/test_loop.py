@@ -509,11 +509,11 @@ def test_an_interrupt_stops_after_the_call_and_its_validation_and_saves(
     assert list(held_out(folder)) == [40, 80, 100]
 
 
-@pytest.mark.parametrize("full", ["metrics", "tensorboard", "validated", "checkpoints"])
+@pytest.mark.parametrize("full", ["metrics", "tensorboard", "validated", "checkpoints", "policy"])
 def test_a_full_disk_stops_the_run_and_loses_nothing_that_is_learnt(
     full: str, folder: RunFolder, display: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At the third call; the policy is exported all the same."""
+    """At the third call, or at the end; the policy is exported if it can be."""
     error, exported = OSError(28, "No space left on device", "the file"), []
 
     def program(state: Any) -> Any:
@@ -534,6 +534,9 @@ def test_a_full_disk_stops_the_run_and_loses_nothing_that_is_learnt(
 
     def export(run: Run, state: Any, seconds: float) -> list[str]:
         exported.append(float(state.weights))
+        if full == "policy":
+            raise error
+        folder.policy.touch()
         return ["the policy"]
 
     changes = {"eval_every": 20, "checkpoint_seconds": 1e-9 if full == "checkpoints" else 1e9}
@@ -543,17 +546,18 @@ def test_a_full_disk_stops_the_run_and_loses_nothing_that_is_learnt(
     monkeypatch.setattr(run_module.finish, "export", export)
     with pytest.raises(checkpoints.SaveError) as raised:
         run_module._learn(run, False)
-    assert exported == [7.0]
+    assert exported == [31.0 if full == "policy" else 7.0]
     reason = {
         "metrics": f"cannot write {folder.path}: No space left on device",
         "checkpoints": f"the checkpoint {folder.checkpoints / '60'} cannot be written: Not a dir",
     }.get(full, "cannot write the file: No space left on device")
     assert str(raised.value).startswith(reason)
-    so_far = f"the policy so far is {folder.policy}; continue with --resume {folder.path}"
-    assert str(raised.value).endswith(f"; {so_far}")
+    so_far = f"; the policy so far is {folder.policy}" if full != "policy" else "on device"
+    assert str(raised.value).endswith(f"{so_far}; continue with --resume {folder.path}")
     assert STOPPING not in display.lines, "nobody has interrupted"
     if full != "checkpoints":
-        assert checkpoints.saved_steps(folder.checkpoints) == [60]
+        last = 100 if full == "policy" else 60
+        assert checkpoints.saved_steps(folder.checkpoints) == [last]
 
 
 def test_a_second_interrupt_does_not_wait_for_the_call(
