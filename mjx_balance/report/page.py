@@ -81,7 +81,7 @@ def write_report(
         "video": None,
         "training": training_pictures(runs, config),
         "config": config and config_tables(config),
-        "commands": commands(runs, out),
+        "commands": commands(runs, out, scenarios, robot),
         "versions": "",
     }
     if first is not None and first.policy is not None:
@@ -126,7 +126,12 @@ def render_page(page: dict[str, Any]) -> str:
 
 
 def seeds_statistics(run: Run, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
-    """Suite -> statistics over the seeds of runs like `run`; empty for fewer than two seeds."""
+    """Suite -> statistics over the seeds of runs like `run`.
+
+    Empty for fewer than two seeds, and for a sweep, whose seeds have other configs.
+    """
+    if run.config is not None and run.config.sweep:
+        return {}
 
     def recipe(config: Config | None) -> Config | None:
         return config and dataclasses.replace(config, seed=0, num_seeds=1)
@@ -211,13 +216,16 @@ def config_tables(config: Config) -> dict[str, Any]:
     return {"differs": differs, "reward_tilt": config.task.reward_tilt, "everything": everything}
 
 
-def commands(runs: Sequence[Run], out: Path) -> list[str]:
-    """Command lines that reproduce training, evaluation and report."""
+def commands(runs: Sequence[Run], out: Path, scenarios: int, robot: str | None = None) -> list[str]:
+    """Command lines that reproduce training, evaluation and report; as `write_report`."""
     policies = [RunFolder(run.path).policy for run in runs if run.policy is not None]
+    evaluate, report = ["mjx-balance", "evaluate"], ["mjx-balance", "report"]
+    size = ["--scenarios", str(scenarios)]
+    own = ["--robot", robot] if robot else []
     return [
         *(train_command(run.config) for run in runs if run.config is not None),
-        *(shlex.join(["mjx-balance", "evaluate", str(x), "--suite", "corner"]) for x in policies),
-        shlex.join(["mjx-balance", "report", *(str(x.path) for x in runs), "--out", str(out)]),
+        *(shlex.join([*evaluate, str(x), "--suite", "corner", *own]) for x in policies),
+        shlex.join([*report, *(str(x.path) for x in runs), "--out", str(out), *size, *own]),
     ]
 
 

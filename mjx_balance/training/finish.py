@@ -179,7 +179,9 @@ def _choose(run: Run, policies: list[AnyPolicy], each: list[Results], stage: Sta
     best = min(range(len(policies)), key=lambda k: score(validated[k]))
     _hand_out(run, policies[best])
     seeds = [policy.config.seed for policy in policies]
-    summary = {suite: over_seeds([results[suite] for results in each]) for suite in HEADLINE}
+    summary = {}
+    if not run.config.sweep:  # whose seeds have other configs; `_ranked` has their statistics
+        summary = {suite: over_seeds([results[suite] for results in each]) for suite in HEADLINE}
     rows = [
         {"seed": seed, "validation": validation, "evaluation": results}
         for seed, validation, results in zip(seeds, validated, each, strict=True)
@@ -187,7 +189,8 @@ def _choose(run: Run, policies: list[AnyPolicy], each: list[Results], stage: Sta
     values = {"best": seeds[best], "statistics": summary, "seeds": rows}
     write_json(run.folder.seeds_summary, values)
     run.display.say(f"best of the {len(policies)} seeds on the validation set: {seeds[best]}")
-    tables.print_table(run.display.console, tables.seeds_table(summary))
+    if summary:
+        tables.print_table(run.display.console, tables.seeds_table(summary))
     return best
 
 

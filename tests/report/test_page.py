@@ -334,6 +334,9 @@ def test_the_seeds_of_alike_runs_are_put_together(
     assert table[1] == ["paper", "3", "3 of 24", *three * 3]
     assert table[2] == ["corner", "3", "3 of 24", *["1.233 (1.100-1.400)", "1.400"] * 3]
     assert page.seeds_statistics(first, [first, other]) == {}, "one seed needs no statistics"
+    sweep = dataclasses.replace(config, num_seeds=2, sweep=("gamma=0.1,0.4",))
+    of_sweep = run_of("f", sweep, 0.1, 0.2, 0.3, 0.4)
+    assert page.seeds_statistics(of_sweep, [of_sweep]) == {}, "its seeds have other gammas"
     lost = run_of("e", None, 0.1, 0.3)
     alone = page.seeds_statistics(lost, [first, lost])
     assert alone["paper"]["seeds"] == 2, "without its config a run stands alone"
@@ -361,12 +364,19 @@ def test_the_commands_make_everything_again(policy: Policy) -> None:
         Run(Path("b b"), policy=policy),
         Run(Path("c")),
     ]
-    assert page.commands(runs, Path("out.html")) == [
+    assert page.commands(runs, Path("out.html"), 8) == [
         "mjx-balance train --preset default --seed 0",
         "mjx-balance evaluate a/policy.safetensors --suite corner",
         "mjx-balance evaluate 'b b/policy.safetensors' --suite corner",
-        "mjx-balance report a 'b b' c --out out.html",
+        "mjx-balance report a 'b b' c --out out.html --scenarios 8",
     ]
+    assert page.commands(runs[2:], Path("x"), 5, "my rex.toml") == [
+        "mjx-balance report c --out x --scenarios 5 --robot 'my rex.toml'"
+    ]
+    evaluate = page.commands(runs[1:2], Path("x"), 5, "rex.toml")[0]
+    assert evaluate == (
+        "mjx-balance evaluate 'b b/policy.safetensors' --suite corner --robot rex.toml"
+    )
     best = preset("best")
     dqn = dataclasses.replace(best.dqn, gamma=0.77, mirror=False, hidden_sizes=(8, 9))
     command = page.train_command(dataclasses.replace(best, dqn=dqn, num_envs=64, seed=5))

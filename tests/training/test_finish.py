@@ -279,6 +279,8 @@ def test_a_sweep_is_ranked_by_falls_and_tilt_of_its_seeds(
     assert worst["statistics"]["corner"]["mean"]["iqm"] == pytest.approx(0.65)
     assert best["statistics"]["corner"]["seeds"] == 2
     assert best["statistics"]["corner"]["falls"] == 14
+    summary = json.loads(folder.seeds_summary.read_text())
+    assert (summary["statistics"], len(summary["seeds"])) == ({}, 4), "no mean over both gammas"
 
 
 def test_falls_rank_before_tilt() -> None:
