@@ -79,7 +79,7 @@ def train(
         run = Run(sized, env, learner, folder, display, processes, listeners, own, keep, still)
         _announce(run)
         with _locked(run), contextlib.closing(listeners):
-            listeners.on_start(sized, folder.path)
+            processes.run_on_all(lambda: listeners.on_start(sized, folder.path), ConfigError)
             policies = _learn(run, profile)
             processes.leave()  # what follows takes minutes of one process, and no device
             if not processes.first:

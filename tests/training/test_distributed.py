@@ -98,6 +98,21 @@ def test_neither_a_proxy_nor_ipv6_is_in_the_way(
         process.end(0)
 
 
+def test_a_tracker_that_does_not_start_ends_both_at_once(
+    start_two: StartTwo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the first process asks it."""
+    (tmp_path / "wandb.py").write_text("def init(**given): raise RuntimeError('no login')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    both = start_two(*FLAGS, "--run-dir", tmp_path / "run", "--track", "wandb")
+    both[0].wait(lambda: False)
+    ended = time.monotonic()
+    output = [process.end(2) for process in both]
+    assert time.monotonic() - ended < 60, "JAX would wait for 300 s"
+    assert "track is wandb, which does not start: no login" in output[0]
+    assert "Traceback" not in "".join(output)
+
+
 def test_a_killed_and_a_stopped_process_lose_nothing(
     alone: RunFolder, start_two: StartTwo, tmp_path: Path, start_train: Any
 ) -> None:
