@@ -20,7 +20,7 @@ in memory, which costs milliseconds; ours validate and write a file.
     python benchmarks/peers.py --json benchmarks/peers.json --write benchmarks/README.md
 
 Runs that are in the JSON file are not run again, so that an interrupted measurement goes on.
-`--figure docs/peers.svg` draws the curves.
+`python docs/figures.py peers` draws the curves.
 """
 
 import argparse
@@ -30,6 +30,7 @@ import functools
 import importlib.util
 import itertools
 import json
+import math
 import os
 import runpy
 import statistics
@@ -326,22 +327,27 @@ def seconds_to_balance(points: Sequence[Row]) -> float | None:
     return next((x["seconds"] for x in points if balances(x)), None)
 
 
+def median_seconds(runs: Sequence[Sequence[Row]]) -> float | None:
+    """The median of `seconds_to_balance`; a run that does not balance takes longest."""
+    seconds = statistics.median(seconds_to_balance(x) or math.inf for x in runs)
+    return seconds if math.isfinite(seconds) else None
+
+
 def summary(name: str, rows: Sequence[Row], best: float | None) -> Row:
     """A row of the table from a contender's runs; `best` is the time of the fastest of ours."""
     runs = [row["points"] for row in rows]
-    times = [x for x in map(seconds_to_balance, runs) if x is not None]
-    middle = statistics.median(times) if times else None
+    middle, count = median_seconds(runs), sum(seconds_to_balance(x) is not None for x in runs)
     rates = [
         (b["decisions"] - a["decisions"]) / (b["seconds"] - a["seconds"])
         for a, b in ((points[0], points[-1]) for points in runs if len(points) > 1)
     ]
     ends = [points[-1] for points in runs]
-    reached = f" ({len(times)} of {len(runs)})" if 0 < len(times) < len(runs) else ""
+    reached = f" ({count} of {len(runs)})" if 0 < count < len(runs) else ""
     return {
         "contender": name,
         "seeds": len(runs),
         "decisions/s": f"{statistics.median(rates):,.0f}" if rates else "-",
-        "s to 0.10 deg": f"{middle:.0f}{reached}" if middle else "not reached",
+        "s to 0.10 deg": (f"{middle:.0f}" if middle else "not reached") + reached,
         "this / ours": f"{middle / best:.1f}" if middle and best else "-",
         "end, s": f"{statistics.median(x['seconds'] for x in ends):.0f}",
         **{
@@ -359,9 +365,8 @@ def table_lines(rows: Sequence[Row], scenarios: int) -> list[str]:
     runs = {name: [x for x in rows if x["contender"] == name] for name in (*OURS, *PEERS)}
     runs = {name: own for name, own in runs.items() if own}
     cold = [name for name in runs if name in OURS and not OURS[name].warm]
-    times = [[seconds_to_balance(x["points"]) for x in runs[name]] for name in cold]
-    whole = [statistics.median(x) for x in times if None not in x]  # pyright: ignore
-    best = min(whole, default=None)
+    times = [median_seconds([x["points"] for x in runs[name]]) for name in cold]
+    best = min((x for x in times if x is not None), default=None)
     cells = [summary(name, own, best) for name, own in runs.items()]
     note = (
         f"Seconds from the start of the process to the first policy of at most 0.10 deg mean tilt "
@@ -396,7 +401,14 @@ def main() -> int:
     if args.json and not args.json.absolute().parent.is_dir():
         return complain(f"cannot write {args.json}: its folder does not exist")
     known = args.json and args.json.is_file()
-    rows = json.loads(args.json.read_text())["rows"] if known else []
+    saved = json.loads(args.json.read_text()) if known else {}
+    rows, size = saved.get("rows", []), {x: getattr(args, x) for x in ("scenarios", "seconds")}
+    for flag, value in size.items():
+        if rows and saved.get(flag) != value:
+            return complain(
+                f"{args.json} was measured with --{flag} {saved.get(flag)}, not {value}; go on "
+                "with that, or name another file"
+            )
     code = 0
     with tempfile.TemporaryDirectory() as work:
         try:
@@ -406,7 +418,7 @@ def main() -> int:
                 common.log(f"{name}, seed {seed}:")
                 points = (run_ours if name in OURS else run_peer)(name, seed, args, Path(work))
                 rows.append({"contender": name, "seed": seed, "points": points})
-                common.save(args.json, rows, scenarios=args.scenarios)
+                common.save(args.json, rows, **size)
         except (ContenderError, OSError) as error:
             code = complain(str(error))
         except KeyboardInterrupt:

@@ -330,14 +330,14 @@ def test_the_table_compares_with_the_fastest_of_ours(peers: types.ModuleType) ->
 
     rows = [
         *(*runs("default", 30.0, 28.0, 32.0), *runs("quick", 10.0, 12.0, None)),
-        *(*runs("quick-warm", 4.0), *runs("brax-sac", 60.0, None, 90.0), *runs("sb3-dqn", None)),
+        *(*runs("quick-warm", 4.0), *runs("brax-sac", 60.0, None, None), *runs("sb3-dqn", None)),
     ]
     lines = peers.table_lines(rows, 16)
     assert [line.split(" | ")[3:5] for line in lines[2:7]] == [
-        ["11 (2 of 3)", "0.4"],
-        ["30", "1.0"],
-        ["4", "0.1"],
-        ["75 (2 of 3)", "2.5"],
+        ["12 (2 of 3)", "1.0"],
+        ["30", "2.5"],
+        ["4", "0.3"],
+        ["not reached (1 of 3)", "-"],
         ["not reached", "-"],
     ]
     assert lines[2].startswith("| quick | 3 | 100 | ")
@@ -379,6 +379,9 @@ def test_runs_stay_when_a_contender_fails_and_are_not_repeated(
         [row] = json.loads(file.read_text())["rows"]
         assert row["points"] == [point(9.0, 0.09, 0.1)]
         assert "| quick | 1 | - | 9 |" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["peers.py", *flags, "--scenarios", "8"])
+    assert peers.main() == 2
+    assert f"{file} was measured with --scenarios 16, not 8; go on" in capsys.readouterr().err
     assert begun == ["quick", "default", "default"]
     assert not page.exists()
 
