@@ -3,7 +3,6 @@
 import argparse
 import concurrent.futures
 import multiprocessing
-import os
 import platform
 import random
 import statistics
@@ -70,11 +69,13 @@ def ratio(slower: Sequence[float], faster: Sequence[float]) -> float:
 
 def hardware() -> Row:
     """What this machine is."""
+    from mjx_balance.machine import cores
+
     model, cpuinfo = platform.processor(), Path("/proc/cpuinfo")
     if cpuinfo.is_file():
         names = [x for x in cpuinfo.read_text().splitlines() if x.startswith("model name")]
         model = names[0].split(":", 1)[1].strip() if names else model
-    return {"cpu": model, "cores": os.cpu_count(), "system": platform.platform()}
+    return {"cpu": model, "cores": cores(), "system": platform.platform()}
 
 
 def machine() -> str:

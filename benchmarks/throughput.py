@@ -32,6 +32,7 @@ from common import Row
 from mujoco.batch import Batch
 
 from mjx_balance.config import Config, preset
+from mjx_balance.machine import cores
 from mjx_balance.quiet import quiet_imports
 
 with quiet_imports("torch"):
@@ -146,7 +147,7 @@ def batch_peer(scene: Scene, num_envs: int) -> tuple[Callable[[], Any], int]:
     ctrl = np.zeros((num_envs, task.sim_steps, scene.model.nu))
     ctrl[..., scene.leg_ctrl] = legs + rng.uniform(-0.01, 0.01, (num_envs, 1, *legs.shape))
     ctrl[..., scene.board_ctrl] = turned[:, None] * rng.choice((-1, 1), (num_envs, 1, 2))
-    batch = Batch(scene.model, num_envs, os.cpu_count() or 1)
+    batch = Batch(scene.model, num_envs, cores())
     repeats = max(1, DECISIONS_PER_CALL // num_envs)
 
     def roll() -> None:

@@ -27,7 +27,7 @@ from mjx_balance.evaluation.rollout import observing, policy_scene, run_suite
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS
 from mjx_balance.machine import cores
 from mjx_balance.policy.file import Policy, load_policy, save_policy
-from mjx_balance.robots.catalogue import makers, shipped
+from mjx_balance.robots.catalogue import makers
 from mjx_balance.robots.limits import for_robot
 from mjx_balance.sim.scene import load_scene
 from mjx_balance.training import sizing
@@ -102,9 +102,9 @@ def main() -> None:
     """Trains, writes, judges."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # pyright: ignore
     default = sorted(["quadruped", *makers()])
-    parser.add_argument("--robots", nargs="+", default=default, choices=shipped())
+    parser.add_argument("--robots", nargs="+", default=default, choices=default)
     unseen = "robots to be judged on alone"
-    parser.add_argument("--unseen", nargs="*", default=[], choices=shipped(), help=unseen)
+    parser.add_argument("--unseen", nargs="*", default=[], choices=default, help=unseen)
     parser.add_argument("--preset", default="best")
     parser.add_argument("--decisions", type=int, default=60_000, help="of each robot")
     parser.add_argument("--envs", type=int, default=32, help="of each robot")

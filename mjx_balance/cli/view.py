@@ -34,8 +34,8 @@ class ViewArgs(ControllerArgs):
     """Watch a policy in MuJoCo's viewer; keys tilt the board and push the robot."""
 
     suite: str | None = None
-    """Suite that moves the board and pushes the robot, or module:NAME of your own; none: keys
-    do."""
+    """Suite that moves the board and pushes the robot, or, not in a browser, module:NAME of your
+    own; none: keys do."""
     seed: int = 0
     """Seed of the suite's scenarios, and of the direction of pushes by key."""
     browser: bool = False

@@ -184,8 +184,9 @@ def learn(
     The state is saved either way; what cannot be written is noted in `stop`.
 
     A validation comes before the line of metrics and the checkpoint of its call, so that a resumed
-    run neither misses it nor logs it twice. Of several processes all call the program and save;
-    the first one logs, shows and validates. An interrupt of one stops all.
+    run neither misses it nor logs it twice, unless the disk was too full for the line alone. Of
+    several processes all call the program and save; the first one logs, shows and validates. An
+    interrupt of one stops all.
 
     Returns:
       The last state, and the seconds spent learning by this call, validations apart.
