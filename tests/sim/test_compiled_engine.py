@@ -1,6 +1,8 @@
 """MuJoCo's C engine inside a jitted program: the same env as over MJX, call by call."""
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -268,6 +270,33 @@ def test_an_engine_is_used_again_where_its_models_are_right(scene: Scene) -> Non
             assert again is other
     with pool._borrowed(4, None) as plain:
         assert plain not in (one, other)
+
+
+def test_results_are_copied_before_another_device_has_the_engine(
+    scene: Scene, engine: JaxEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here one borrows the engine as soon as it is free again, and puts its robots to rest."""
+    pool, ids = _Pool(scene, 1), np.arange(2)
+    borrowed = pool._borrowed
+
+    @contextmanager
+    def contested(count: int, params: DomainParams | None) -> Iterator[MujocoEngine]:
+        with borrowed(count, params) as own:
+            yield own
+        with borrowed(count, params) as same:
+            assert same is own
+            same.reset(ids)
+
+    monkeypatch.setattr(pool, "_borrowed", contested)
+    state, ctrl = jax.device_get(held(engine, 2))
+    alone = MujocoEngine(scene, 2)
+    alone.set_state(*(np.asarray(x, float) for x in state))
+    motion = alone.roll(ids, np.asarray(ctrl, float), None)
+    expected = *alone.state(), *motion
+    results = [np.empty(x.shape, np.float32) for x in expected]
+    pool.advance([*state, ctrl], results)
+    for ours, theirs in zip(results, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
 def test_engines_of_other_threads_have_other_names(scene: Scene) -> None:

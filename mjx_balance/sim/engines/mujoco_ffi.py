@@ -74,10 +74,10 @@ class _Pool:
         with self._borrowed(count, params) as engine:
             engine.set_state(*state)
             motion = engine.roll(np.arange(count), ctrl, params)
-            values = (*engine.state(), *motion)
-        with np.errstate(over="ignore"):  # beyond float32, a diverged env's value is inf
-            for result, value in zip(results, values, strict=True):
-                result.reshape(value.shape)[...] = value
+            # Here, because the state is memory of the engine, which the next borrower overwrites.
+            with np.errstate(over="ignore"):  # beyond float32, a diverged env's value is inf
+                for result, value in zip(results, (*engine.state(), *motion), strict=True):
+                    result.reshape(value.shape)[...] = value
 
     @contextmanager
     def _borrowed(self, count: int, params: DomainParams | None) -> Iterator[MujocoEngine]:
