@@ -5,7 +5,9 @@ cites a section of the paper; "chosen" marks a number that the paper does not gi
 """
 
 import dataclasses
+import functools
 import math
+import typing
 from typing import Annotated, Any, Literal, Self
 
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
@@ -39,8 +41,29 @@ class ConfigError(InputError):
     """Invalid config; the message names the field and a remedy."""
 
 
+class _Floats:
+    """Makes floats of whole numbers given for float fields: arrays take their type from them."""
+
+    def __post_init__(self) -> None:
+        for name in _float_fields(type(self)):
+            object.__setattr__(self, name, _as_float(getattr(self, name)))
+
+
+@functools.cache
+def _float_fields(kind: type) -> list[str]:
+    hints = typing.get_type_hints(kind)
+    return [name for name, hint in hints.items() if float in (hint, *typing.get_args(hint))]
+
+
+def _as_float(value: Any) -> Any:
+    """The value, with a float for each int that `check` might accept."""
+    if isinstance(value, tuple):
+        return tuple(map(_as_float, value))
+    return float(value) if type(value) is int and abs(value) < HUGE else value
+
+
 @dataclasses.dataclass(frozen=True)
-class TaskConfig:
+class TaskConfig(_Floats):
     """The control problem (paper section 3)."""
 
     __pydantic_config__ = STRICT
@@ -160,7 +183,7 @@ class TaskConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class RandomizationConfig:
+class RandomizationConfig(_Floats):
     """Ranges of the domain randomisation, in training and in suites; off by default (paper)."""
 
     __pydantic_config__ = STRICT
@@ -251,7 +274,7 @@ class RandomizationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class DQNConfig:
+class DQNConfig(_Floats):
     """The learner (paper sections 2 and 3.2)."""
 
     __pydantic_config__ = STRICT
@@ -312,7 +335,7 @@ class DQNConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_Floats):
     """All settings of a run; in Python, a bare `Config()` has the paper's values."""
 
     __pydantic_config__ = STRICT

@@ -483,6 +483,19 @@ def test_a_field_is_replaced_by_its_name_alone() -> None:
     assert both.dqn == preset("best").dqn
 
 
+def test_a_whole_number_is_as_good_as_a_float() -> None:
+    """Else arrays made from it hold whole numbers, and a policy's manifest differs."""
+    whole = TaskConfig(fail_tilt=8, sea_angle=3, mean_times=(1, 2), episode_length=100)
+    assert repr(whole) == repr(
+        TaskConfig(fail_tilt=8.0, sea_angle=3.0, mean_times=(1.0, 2.0), episode_length=100)
+    )
+    config = preset("best").replace(task=whole, payload=5, huber_delta=1, eval_duration=60, seed=3)
+    values = config.task, config.randomization.payload, config.dqn.huber_delta, config.eval_duration
+    assert repr(values) == f"({whole}, 5.0, 1.0, 60.0)"
+    assert repr(check(config).seed) == "3"
+    assert repr(dataclasses.replace(config.task, board_rate=3).board_rate) == "3.0"
+
+
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
