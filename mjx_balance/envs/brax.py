@@ -60,7 +60,7 @@ class _Endless(Wrapper):
 
 
 class _NewScenarios(AutoResetWrapper):
-    """brax's automatic reset, but to a new episode: state and `info` from a fresh key."""
+    """brax's automatic reset, but to a new episode: all of its state from a fresh key."""
 
     def __init__(self, env: Env):
         super().__init__(env)
@@ -88,5 +88,6 @@ class _NewScenarios(AutoResetWrapper):
         info = {name: choose(start.info[name], after.info[name]) for name in self._own}
         return after.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=jax.tree.map(choose, start.pipeline_state, after.pipeline_state),
+            obs=jax.tree.map(choose, start.obs, after.obs),
             info=after.info | info,
         )

@@ -13,11 +13,12 @@ from fixtures.fleet import with_state
 
 from mjx_balance.config import Config, ConfigError, RandomizationConfig, preset
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.envs.batch import Episodes
+from mjx_balance.envs.batch import BatchEnv, Episodes
 from mjx_balance.envs.brax import wrap
 from mjx_balance.evaluation.controllers import View
 from mjx_balance.evaluation.rollout import roll_out, run_suite
 from mjx_balance.evaluation.suites import HEADLINE, SEEDS, draw_suite
+from mjx_balance.sim.scene import load_scene
 from mjx_balance.task.actions import action_table
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -126,6 +127,21 @@ def test_after_its_end_an_episode_is_as_after_a_reset(env: BalanceEnv, states: l
         assert (before.targets[k] != after.targets[k]).any()
     begun = {float(states[n].pipeline_state.scenario.phase[k]) for n, k in ends}
     assert len(begun) == len(ends)
+
+
+@pytest.mark.slow
+def test_the_first_observation_is_of_the_new_scenario() -> None:
+    """Of boards that start tilted; as plain MuJoCo observes them at rest on such a board."""
+    config = short().replace(start_incline=5.0, episode_length=1)
+    env = wrap(BalanceEnv(config, "continuous"), 1)
+    first = jax.jit(env.reset)(keys(ENVS))
+    second = jax.device_get(jax.jit(env.step)(first, jnp.zeros((ENVS, 2))))
+    assert second.done.all()
+    rngs = [np.random.default_rng(0)] * ENVS
+    for state in (jax.device_get(first), second):
+        episodes = Episodes(state.pipeline_state.scenario, rngs=rngs)
+        expected = BatchEnv(load_scene(config), episodes).initial_obs
+        np.testing.assert_allclose(state.obs, expected, atol=2e-4)
 
 
 @pytest.mark.slow
