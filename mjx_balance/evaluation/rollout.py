@@ -227,7 +227,7 @@ def policy_scene(policy: GreedyPolicy, robot: str | None = None) -> Scene:
 
 
 def suite_scene(scene: Scene, suite: str | Suite) -> Scene:
-    """The scene in which a suite runs: this one, or one with a platform or soft servos.
+    """The scene in which a suite runs: this one, or one with a platform, soft servos or both.
 
     Raises:
       SuiteError: as `find_suite`.
@@ -235,7 +235,7 @@ def suite_scene(scene: Scene, suite: str | Suite) -> Scene:
     chosen = find_suite(suite)
     if chosen.platform and not scene.task.platform:
         task = dataclasses.replace(scene.task, platform=True)
-        return load_scene(Config(robot=scene.robot_source, task=task))
+        scene = load_scene(Config(robot=scene.robot_source, task=task))
     return soften(scene) if chosen.soft else scene
 
 

@@ -13,7 +13,14 @@ from mjx_balance.envs.balance import BalanceEnv
 from mjx_balance.envs.batch import BatchEnv, Episodes, rows
 from mjx_balance.evaluation.controllers import View, make_controller
 from mjx_balance.evaluation.rollout import roll_out, run_suite, suite_scene
-from mjx_balance.evaluation.suites import SEEDS, SUITES, SuiteError, draw_suite, standing_still
+from mjx_balance.evaluation.suites import (
+    SEEDS,
+    SUITES,
+    Suite,
+    SuiteError,
+    draw_suite,
+    standing_still,
+)
 from mjx_balance.robots.catalogue import Robot, find_robot
 from mjx_balance.robots.limits import authority, for_robot, greatest_incline
 from mjx_balance.sim.scene import Scene, load_scene
@@ -238,6 +245,13 @@ def test_soft_is_the_scene_of_our_soft_robot(config: Config) -> None:
     np.testing.assert_allclose(soft.stance.leg_trim, expected.stance.leg_trim, atol=1e-9)
     again = suite_scene(soft, "soft")
     assert again.hash == soft.hash, "soft servos stay as they are"
+
+
+def test_a_suite_may_have_a_platform_and_soft_servos(config: Config, scene: Scene) -> None:
+    both = suite_scene(scene, Suite(motion="sea", platform=True, soft=True))
+    expected = load_scene(config.replace(robot="quadruped_soft", platform=True))
+    assert both.hash == expected.hash
+    assert both.hash not in (suite_scene(scene, "soft").hash, suite_scene(scene, "platform").hash)
 
 
 def test_soft_goes_with_weight_and_leg() -> None:
