@@ -144,7 +144,7 @@ def main() -> None:
             make = functools.partial(observing, policy)
             name = f"policy {policy.fingerprint}"
             networks.append(suite_result(args.out, name, policy, make, suite, count, parts))
-        settled += [x["action_mm_settled"] or 0 for x in networks]  # at sea no board rests
+        settled += [x["action_mm_settled"] or 0 for x in networks]  # only ramps have a rest
         rows.append(suite_row(suite, networks))
         for name in baselines:
             make = functools.partial(make_controller, name, policy_scene(first))

@@ -35,7 +35,7 @@ from mjx_balance.evaluation.rollout import (
     settled_action,
     summarize,
 )
-from mjx_balance.evaluation.suites import draw_suite
+from mjx_balance.evaluation.suites import Suite, draw_suite
 from mjx_balance.policy.file import PolicyError, load_policy, save_policy
 from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.robots.catalogue import SHIPPED as SHIPPED_ROBOTS
@@ -375,6 +375,17 @@ def test_settled_action_leaves_out_the_fallen(config: Config) -> None:
     assert settled_action(made_up(config, action_mm=actions[:, :35])) is None
     actions[:, 30:] = np.nan
     assert settled_action(made_up(config, action_mm=actions)) is None
+
+
+@pytest.mark.parametrize("suite", ["steps", "sea", "platform", Suite(motion="ramps")])
+def test_no_action_is_settled_where_the_board_may_turn_at_any_time(
+    config: Config, suite: str | Suite
+) -> None:
+    """Training's motions begin at a random part of the period; those of suites at its start."""
+    rollout = made_up(config, action_mm=np.full((2, 50), 0.4))
+    assert summarize(rollout, suite, 10, 7)["action_mm_settled"] is None
+    for ramps in ("corner", Suite(fast=True)):
+        assert summarize(rollout, ramps, 10, 7)["action_mm_settled"] == pytest.approx(0.4)
 
 
 def grid(falls: list[list[float]]) -> Envelope:
