@@ -143,7 +143,7 @@ def draw_suite(
     """Draws a suite's episodes, each of `duration` s.
 
     Scenario k of a seed is the same however many are drawn. Ramps, sensor noise, pushes, other
-    motions, starts, sensor errors and events each have their own generator, which
+    motions, starts, sensor errors, events and softness each have their own generator, which
     differs in the last number of its seed.
 
     Raises:
@@ -180,7 +180,11 @@ def draw_suite(
         own = [np.random.default_rng((seed, k, 5)) for k in range(scenarios)]
         numbers = np.asarray([rng.uniform(size=count_draws(robot)) for rng in own])
         errors = draw_errors(ranges, robot, numbers)
-    params = draw_params(ranges, robot, others[:, :DRAWS]) if ranges.varies else None
+    numbers = others[:, :DRAWS]
+    if ranges.soft_share:
+        own = [np.random.default_rng((seed, k, 7)).uniform(size=1) for k in range(scenarios)]
+        numbers = np.hstack((numbers, own))
+    params = draw_params(ranges, robot, numbers) if ranges.varies else None
     own = (np.random.default_rng((seed, k, 6)) for k in range(scenarios))
     event = events.sample_event(
         *(ranges, robot, params, round(duration / task.ctrl_dt)),

@@ -33,7 +33,7 @@ def with_task(config: Config, **values: float) -> Config:
     return dataclasses.replace(config, task=dataclasses.replace(config.task, **values))
 
 
-def draw(config: Config, suite: str, *rest: Any) -> Episodes:
+def draw(config: Config, suite: str | Suite, *rest: Any) -> Episodes:
     """In a scene that fits the suite."""
     task = dataclasses.replace(config.task, platform=suite == "platform")
     return draw_suite(task, find_robot(config.robot), suite, *rest)
@@ -82,6 +82,20 @@ def test_circumstances_by_their_draws(config: Config) -> None:
     noise = draw(config, "noise", 2, 60.0, 2).rngs
     own = [np.random.default_rng((2, k, 1)).normal() for k in range(2)]
     assert [rng.normal() for rng in noise] == own, "from generators of their own"
+
+
+def test_soft_servos_and_delayed_actions_come_independently(config: Config) -> None:
+    """Of each kind half: a quarter has both. The delays are those of a suite without softness."""
+    late = RandomizationConfig(latency_share=0.5)
+    suites = Suite(late), Suite(dataclasses.replace(late, soft_share=0.5))
+    alone, both = (draw(config, suite, 400, 1.0, 0).params for suite in suites)
+    np.testing.assert_array_equal(both.delay, alone.delay)
+    kinds = 2 * (both.delay > 0) + (both.softness > 0)
+    counts = np.bincount(kinds, minlength=4)
+    assert counts.min() > 75
+    assert counts.max() < 125
+    own = np.random.default_rng((0, 7, 7)).uniform()
+    assert both.softness[7] == (2 * own if own < 0.5 else 0)
 
 
 def test_fast_and_steep_by_their_draws(config: Config, robot: Robot) -> None:
