@@ -28,7 +28,7 @@ def check(config: Config) -> Config:
     _check_motions(config.task)
     _check_inputs(config.task)
     _check_learning(config)
-    _check_randomization(config.randomization, config.task)
+    check_randomization(config.randomization, config.task)
     if config.export == "best" and not config.eval_every:
         raise ConfigError(
             "export is 'best', but eval_every is 0, so that nothing is validated to choose from; "
@@ -140,7 +140,8 @@ def _check_learning(config: Config) -> None:
         )
 
 
-def _check_randomization(ranges: RandomizationConfig, task: TaskConfig) -> None:
+def check_randomization(ranges: RandomizationConfig, task: TaskConfig) -> None:
+    """Raises `ConfigError` if ranges contradict each other or the length of a decision."""
     least, most = ranges.friction_min, ranges.friction_max
     if least is not None and most is not None and most < least:
         raise ConfigError(f"friction_max is {most}; it must not be less than friction_min, {least}")

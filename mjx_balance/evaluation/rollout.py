@@ -253,7 +253,7 @@ def evaluate(
     `robot` is as in `policy_scene`.
 
     Raises:
-      EvaluationError, SuiteError: as `run_suite`.
+      ConfigError, EvaluationError, SuiteError: as `run_suite`.
       PolicyError: as `policy_scene`.
     """
     scene = policy_scene(policy, robot)
@@ -298,7 +298,7 @@ def run_suite(
 
     Raises:
       EvaluationError: if there are no scenarios or no time, or too much for the memory.
-      SuiteError: as `draw_suite`.
+      ConfigError, SuiteError: as `draw_suite`.
     """
     scene = suite_scene(scene, suite)
     check_fits(scene.task, scenarios, duration, scene.model.nq if record else 0)

@@ -8,11 +8,18 @@ import numpy as np
 
 from mjx_balance.config import DEGREE, RandomizationConfig, TaskConfig
 from mjx_balance.config.sea import check_platform
+from mjx_balance.config.validation import check_randomization
 from mjx_balance.envs.batch import Episodes, stacked
 from mjx_balance.errors import InputError, quote, suggest
 from mjx_balance.files.validation import check_types
 from mjx_balance.robots.catalogue import Robot
-from mjx_balance.robots.limits import authority, check_delays, greatest_incline, scale_ranges
+from mjx_balance.robots.limits import (
+    authority,
+    check_delays,
+    check_friction,
+    greatest_incline,
+    scale_ranges,
+)
 from mjx_balance.task import events, tilt
 from mjx_balance.task.pushes import Pushes, draw_velocity, push_decisions
 from mjx_balance.task.randomization import DRAWS, draw_params
@@ -129,6 +136,11 @@ def find_suite(suite: str | Suite) -> Suite:
     if suite.motion is not None and suite.motion not in tilt.MOTIONS:
         remedy = suggest("motion", suite.motion, tilt.MOTIONS)
         raise SuiteError(f"motion of suite {suite.name} is {quote(suite.motion)}; {remedy}")
+    if suite.platform and suite.motion != "sea":
+        raise SuiteError(
+            f"platform of suite {suite.name} is True, but its motion is {quote(suite.motion)}; a "
+            "platform moves with the sea alone: motion must be 'sea'"
+        )
     return suite
 
 
@@ -147,7 +159,8 @@ def draw_suite(
     differs in the last number of its seed.
 
     Raises:
-      ConfigError: if the sea of the config is out of bounds, or a decision shorter than the delays.
+      ConfigError: if the sea of the config is out of bounds, a decision shorter than the delays, or
+        a range of the suite contradicts another one, the task or the robot.
       SuiteError: for an unknown suite, a negative seed, a suite that needs another scene
         (`rollout.suite_scene`), or a board that does not arrive before its next target.
     """
@@ -174,6 +187,8 @@ def draw_suite(
             f"target_period is {task.target_period} s, but in suite {name!r} the board may take "
             f"{longest:.1f} s to its target; the period must not be shorter"
         )
+    check_randomization(chosen.randomization, task)
+    check_friction(chosen.randomization, robot)
     ranges, errors = scale_ranges(chosen.randomization, robot), None
     check_delays(task, ranges, robot)
     if ranges.sensors_err:

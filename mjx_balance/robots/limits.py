@@ -124,6 +124,15 @@ def check_robot(config: Config, robot: Robot) -> Config:
             f"{task.ctrl_dt} s, less action_ramp's share of it"
         )
     check_delays(task, ranges, robot)
+    check_friction(ranges, robot)
+    return config
+
+
+def check_friction(ranges: RandomizationConfig, robot: Robot) -> None:
+    """Raises `ConfigError` if the one end of the friction's range that is given passes the other.
+
+    The other is the robot's own friction.
+    """
     own = robot.foot_friction
     if ranges.friction_min is None and (ranges.friction_max or own) < own:
         raise ConfigError(
@@ -135,4 +144,3 @@ def check_robot(config: Config, robot: Robot) -> Config:
             f"friction_min is {ranges.friction_min}; it must not exceed the friction of robot "
             f"{robot.name}, {own}, unless friction_max is given"
         )
-    return config

@@ -291,6 +291,30 @@ def test_impossible_wishes_are_refused(config: Config) -> None:
         draw(config, "moon", 1, 10, 0)
 
 
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"push_min": 0.3}, "^push_max is 0.0; it must not be less than push_min, 0.3$"),
+        ({"push_max": 0.3, "push_period": 0.1}, "^push_period is 0.1 s; .* ctrl_dt, 0.2 s$"),
+        ({"friction_min": 0.5, "friction_max": 0.4}, "^friction_max is 0.4; .* friction_min, 0.5$"),
+        ({"friction_min": 7.0}, "^friction_min is 7.0; .* robot quadruped, 0.[0-9]*, unless"),
+        ({"friction_max": 0.1}, "^friction_max is 0.1; .* robot quadruped, 0.[0-9]*, unless"),
+    ],
+)
+def test_a_suite_whose_ranges_contradict_is_refused(
+    config: Config, values: dict[str, float], sentence: str
+) -> None:
+    """Else it would run without its pushes, or the other way round."""
+    with pytest.raises(ConfigError, match=sentence):
+        draw(config, Suite(RandomizationConfig(**values)), 1, 10.0, 0)
+
+
+@pytest.mark.parametrize("motion", [None, "steps"])
+def test_a_platform_without_a_sea_is_refused(scene: Scene, motion: str | None) -> None:
+    with pytest.raises(SuiteError, match=r"^platform of suite own is True, but .* must be 'sea'$"):
+        suite_scene(scene, Suite(motion=motion, platform=True))
+
+
 def test_no_seed_serves_two_purposes() -> None:
     """What a policy is chosen or tuned by must not be what it is judged by."""
     seeds = dataclasses.astuple(SEEDS)
