@@ -57,10 +57,10 @@ def bounds() -> tuple[float, float]:
 
 
 def significant_angle(task: TaskConfig) -> float:
-    """Significant height of the board's angle, deg, which no angle exceeds.
+    """Significant height of the board's angle, deg, which the waves never exceed.
 
     Raises:
-      ConfigError: if it exceeds max_incline, or the board may turn faster than board_rate.
+      ConfigError: if it exceeds max_incline, or waves may turn the board faster than board_rate.
     """
     fastest = task.board_rate * task.sea_period / bounds()[0]
     if task.sea_angle is None:

@@ -63,11 +63,13 @@ def _check_timing(task: TaskConfig) -> None:
             f"action_levels is {task.action_levels}; it must be odd, so that standing still is an "
             "action"
         )
-    ramp = 2 * task.max_incline / task.board_rate
+    steepest = max(task.max_incline, task.start_incline)
+    ramp = (steepest + task.max_incline) / task.board_rate
     if ramp > task.target_period:
         raise ConfigError(
-            f"target_period is {task.target_period} s, but a board ramp may last twice the "
-            f"greatest incline over board_rate, {ramp:g} s; the period must not be shorter"
+            f"target_period is {task.target_period} s, but a board ramp at board_rate, from "
+            f"{steepest:g} deg to max_incline on the other side, may last {ramp:g} s; the period "
+            "must not be shorter"
         )
 
 
@@ -76,7 +78,8 @@ def _check_motions(task: TaskConfig) -> None:
         raise ConfigError(
             f"board_motions is {task.board_motions}; it must name each kind at most once"
         )
-    slowest = 2 * task.jump_incline / task.target_period
+    jump = task.jump_incline
+    slowest = (max(jump, task.start_incline) + jump) / task.target_period
     if task.step_rate < slowest:
         raise ConfigError(
             f"step_rate is {task.step_rate} deg/s; for a jump to end within target_period, "

@@ -181,7 +181,9 @@ def draw_suite(
     if chosen.steep:
         steepest = greatest_incline(task, robot)
         incline += np.maximum(steepest - task.max_incline, 0) * others[:, DRAWS + 1]
-    longest = float(np.max(2 * incline / rate))
+    limit = np.full(scenarios, task.fail_tilt - math.sqrt(2) * task.board_rate * task.ctrl_dt)
+    steepest = np.maximum(incline, limit) if chosen.tilted else incline
+    longest = float(np.max((steepest + incline) / rate))
     if longest > task.target_period:
         raise SuiteError(
             f"target_period is {task.target_period} s, but in suite {name!r} the board may take "
@@ -219,7 +221,6 @@ def draw_suite(
         own = [np.random.default_rng((seed, k, 3)) for k in range(scenarios)]
         scenario = stacked([draw(still, count, tilt.numpy_uniform(rng)) for rng in own])
     if chosen.tilted:
-        limit = np.full(scenarios, task.fail_tilt - math.sqrt(2) * task.board_rate * task.ctrl_dt)
         own = [np.random.default_rng((seed, k, 4)) for k in range(scenarios)]
         start = tilt.disc_targets(limit, *np.asarray([rng.uniform(size=2) for rng in own]).T)
         scenario = scenario._replace(start=start)

@@ -248,6 +248,15 @@ def test_every_number_has_its_bounds_tested() -> None:
     [
         ({"target_period": 3.9}, "target_period is 3.9 s, but a board ramp .* 4 s; the period"),
         ({"board_rate": 1.0}, "target_period is 10.0 s, but .* 14 s; the period"),
+        # From 5 deg on one side to 2 on the other, at 0.5 deg/s; jumps are of up to 2 deg.
+        (
+            {"max_incline": 2.0, "board_rate": 0.5, "target_period": 8.0, "start_incline": 5.0},
+            "target_period is 8.0 s, but a board ramp .* from 5 deg to .* 14 s; the period",
+        ),
+        (
+            {"step_rate": 0.6, "start_incline": 5.0},
+            "step_rate is 0.6 deg/s; for a jump to end within target_period, .* at least 0.7$",
+        ),
         ({"sea_angle": -2.0}, "sea_angle is -2.0; it must be at least 0"),
         ({"sea_angle": 8.0}, "sea_angle is 8.0 deg; it must not exceed max_incline, 7.0 deg"),
         (
@@ -300,6 +309,8 @@ def test_impossible_config_is_refused(values: dict[str, Any], message: str) -> N
     "values",
     [
         {"friction_min": 0.9, "friction_max": 0.9},
+        {"max_incline": 2.0, "board_rate": 0.5, "target_period": 14.0, "start_incline": 5.0},
+        {"step_rate": 0.7, "start_incline": 5.0},
         {"push_min": 0.2, "push_max": 0.2, "push_period": 0.2},
         {"ctrl_dt": 0.4, "sim_dt": 0.4 / 10_000},
         {"min_replay_size": 64, "replay_capacity": 64},

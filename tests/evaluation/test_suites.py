@@ -163,6 +163,17 @@ def test_a_board_that_does_not_arrive_is_refused(config: Config) -> None:
         draw(with_task(config, target_period=3.99), "corner", 1, 20, 0)
 
 
+def test_a_board_does_not_arrive_from_a_start_that_is_steeper_than_its_targets(
+    config: Config,
+) -> None:
+    """It starts at up to 6 - 0.14 deg and goes to 2 deg on the other side, at 0.5 deg/s: 15.7 s."""
+    slow = {"max_incline": 2.0, "board_rate": 0.5}
+    with pytest.raises(SuiteError, match=r"period is 15\.6 s, but in suite 'recover' .* 15\.7 s"):
+        draw(with_task(config, target_period=15.6, **slow), "recover", 1, 20, 0)
+    draw(with_task(config, target_period=15.8, **slow), "recover", 1, 20, 0)
+    draw(with_task(config, target_period=8.0, **slow), "paper", 1, 20, 0)
+
+
 def test_steps_and_sea_have_generators_of_their_own(config: Config) -> None:
     """So that no draw of another suite changes; a heading of the config holds for all scenarios."""
     for suite in ("steps", "sea"):
