@@ -89,7 +89,7 @@ def suite_result(
 
 
 def fall_free_share(out: Path, policy: Policy) -> float:
-    """Share of the feasible envelope in which a policy does not fall."""
+    """Share of the feasible envelope in which a policy does not fall; 0: nothing is feasible."""
     scene = policy_scene(policy)
 
     def measure(bar: Any) -> Row:
@@ -100,7 +100,7 @@ def fall_free_share(out: Path, policy: Policy) -> float:
     key += f"{ENVELOPE_SCENARIOS} x {ENVELOPE_DURATION:g} s, seed {SEEDS.held_out}"
     fields = dict(cached(out, key, scene, "envelope", measure))
     del fields["code"]
-    return Envelope(**fields).fall_free_share
+    return Envelope(**fields).fall_free_share or 0.0
 
 
 def suite_row(suite: str, networks: list[Row]) -> Row:

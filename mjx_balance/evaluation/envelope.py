@@ -28,12 +28,13 @@ class Envelope:
     seed: int
 
     @property
-    def fall_free_share(self) -> float:
-        """Share of the cells that can be followed in which nothing falls."""
+    def fall_free_share(self) -> float | None:
+        """Share of the cells that can be followed in which nothing falls; None: there is none."""
         feasible = (np.asarray(self.inclines)[:, None] <= self.reach) & (
             np.asarray(self.rates) <= self.authority
         )
-        return float(np.mean(np.asarray(self.fall_rate)[feasible] == 0))
+        free = np.asarray(self.fall_rate)[feasible] == 0
+        return float(free.mean()) if free.size else None
 
 
 ENVELOPE_INCLINES = tuple(np.arange(2.0, 12.1, 1.0).tolist())

@@ -398,6 +398,8 @@ def test_share_of_the_feasible_cells_without_a_fall() -> None:
     assert grid([[0, 0, 1], [0, 0.01, 1], [1, 1, 1]]).fall_free_share == 0.75
     assert grid([[0, 0, 0], [1, 0.5, 0], [0, 0, 0]]).fall_free_share == 0.5
     assert grid([[0, 0, 1], [0, 0, 1], [1, 1, 1]]).fall_free_share == 1.0
+    weak = dataclasses.replace(grid([[0, 0, 0]] * 3), authority=2.9)
+    assert weak.fall_free_share is None
 
 
 def test_cells_of_the_envelope_are_inclines_by_speeds(

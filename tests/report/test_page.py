@@ -196,6 +196,15 @@ def test_the_table_of_baselines_and_the_tiles(policy: Policy) -> None:
     assert captions.endswith("the legs reach 10.3 deg. Inside, 75% of the cells are free of falls.")
 
 
+def test_an_envelope_without_a_feasible_cell_has_no_share(policy: Policy) -> None:
+    measurements = made_up(policy)
+    weak = dataclasses.replace(measurements.envelope, authority=2.4)
+    text = shown(policy, measurements=dataclasses.replace(measurements, envelope=weak))
+    assert "<b>-</b><span>of the feasible envelope free of falls" in text
+    assert "deg. No cell lies inside." in text
+    assert "nan%" not in text
+
+
 def test_what_is_said_of_a_policy_is_said_of_its_own_task(policy: Policy) -> None:
     policy = copy.copy(policy)
     values = {"max_incline": 5.5, "fail_tilt": 8.0, "action_max": 0.0025, "ctrl_dt": 0.4}
