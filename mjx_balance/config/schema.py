@@ -394,13 +394,16 @@ class Config(_Floats):
         list becomes a tuple. `check` finds values that are out of bounds, before anything runs.
 
         Raises:
-          ConfigError: for an unknown field.
+          ConfigError: for an unknown field, or a section of another type.
         """
         values = {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
         known: list[str] = []
         changes: dict[str, Any] = {}
         for name, section in (("", self), *((name, getattr(self, name)) for name in SECTIONS)):
+            kind = type(section)
             section: Any = values.get(name, section)
+            if not isinstance(section, kind):
+                raise ConfigError(f"{name} is {quote(section)}; it must be a {kind.__name__}")
             names = [field.name for field in dataclasses.fields(section)]
             known += names
             own = {field: values[field] for field in names if field in values}

@@ -494,6 +494,12 @@ def test_a_field_is_replaced_by_its_name_alone() -> None:
     assert both.dqn == preset("best").dqn
 
 
+@pytest.mark.parametrize("value", [{"gamma": 1}, None, DQNConfig()])
+def test_a_section_is_replaced_by_one_of_its_kind(value: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^task is .*; it must be a TaskConfig$"):
+        preset("best").replace(task=value, gamma=0.5)
+
+
 def test_a_whole_number_is_as_good_as_a_float() -> None:
     """Else arrays made from it hold whole numbers, and a policy's manifest differs."""
     whole = TaskConfig(fail_tilt=8, sea_angle=3, mean_times=(1, 2), episode_length=100)
