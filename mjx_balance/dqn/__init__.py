@@ -1,4 +1,4 @@
-"""A Deep Q-Network for any brax `Env` with discrete actions."""
+"""A Deep Q-Network for any brax `Env` with discrete actions, or with actions from -1 to 1."""
 
 from mjx_balance.dqn.dqn import DQN, DQNSpec, Loss, TrainState, td_error
 from mjx_balance.dqn.networks import Network, QNetwork

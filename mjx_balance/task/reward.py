@@ -10,7 +10,10 @@ from mjx_balance.task import Array
 
 
 class RewardInputs(NamedTuple):
-    """What the reward looks at of one decision."""
+    """What the reward looks at of one decision.
+
+    With `reward_tilt` "mean" both tilts are means: over the decision before and over this one.
+    """
 
     tilt_before: Float[Array, "*batch"]  #: body tilt when the decision was taken, deg
     tilt_after: Float[Array, "*batch"]  #: body tilt at its end, deg
