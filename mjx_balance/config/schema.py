@@ -284,8 +284,9 @@ class DQNConfig(_Floats):
     learning_rate: Positive = 1e-5
     """Adam step size (paper 3.2)."""
     learning_rate_end_share: NonNegative = 1.0
-    """Learning rate at the end of the run, as a share of learning_rate; a cosine decay leads there
-    (paper: 1)."""
+    """Share of learning_rate to which a cosine decay leads (paper: 1). The decay is as long as if
+    the run learned from its first decision; it ends above that share by what `min_replay_size`
+    leaves out."""
     batch_size: Count = 32
     """Transitions per gradient step (chosen)."""
     replay_ratio: Positive = 32.0

@@ -94,7 +94,11 @@ class DQNSpec:
 
     @property
     def total_updates(self) -> int:
-        """Gradient steps of the whole run, the number of iterations rounded up."""
+        """Gradient steps of a run that learned from its first decision, its iterations rounded up.
+
+        The learning rate's decay is as long. A run makes none before `min_replay_size`, so that
+        it ends somewhat above `learning_rate_end_share`.
+        """
         return -(-self.num_env_steps // self.num_envs) * self.updates_per_iteration
 
     def per_device(self, count: int) -> int:
