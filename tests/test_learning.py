@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fixtures.fleet import observation_names
 from jax import export
 
 from mjx_balance.config import Config, preset
@@ -20,7 +21,6 @@ from mjx_balance.policy.network import Policy
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.engines.jax_engine import JaxEngine, PhysicsState
 from mjx_balance.sim.scene import Scene
-from mjx_balance.task.observation import observation_names
 from mjx_balance.task.step import Motion
 from mjx_balance.training.sizing import make_learner, size_to_device
 

@@ -136,11 +136,6 @@ def _mean_rows(
     ]
 
 
-def observation_names(task: TaskConfig, robot: Robot) -> tuple[str, ...]:
-    """Name of every observation entry, in order."""
-    return tuple(row.name for row in input_rows(task, robot))
-
-
 def lookback(rows: Sequence[Row], signal: str) -> int:
     """Samples of a signal that the rows look back on, the newest included; at least one."""
     ages = [row.lag + row.window for row in rows if _signal(row) == signal]

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from fixtures.fleet import with_state
+from fixtures.fleet import observation_names, with_state
 from scipy.spatial.transform import Rotation
 
 from mjx_balance.config import Config
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.task.observation import observation_names
 from mjx_balance.task.tilt import platform_position
 
 RESETS = 4_000

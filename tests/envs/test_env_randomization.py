@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from fixtures.fleet import with_state
+from fixtures.fleet import observation_names, with_state
 
 from mjx_balance.config import RandomizationConfig, preset
 from mjx_balance.envs.balance import BalanceEnv
-from mjx_balance.task.observation import observation_names
 from mjx_balance.task.randomization import DomainParams
 
 MANY = 4_000

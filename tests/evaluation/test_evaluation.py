@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import psutil
 import pytest
+from fixtures.fleet import observation_names
 from fixtures.policies import random_params, random_policy, rewrite
 from scipy.spatial.transform import Rotation
 
@@ -41,7 +42,6 @@ from mjx_balance.policy.manifest import make_manifest
 from mjx_balance.robots.catalogue import SHIPPED as SHIPPED_ROBOTS
 from mjx_balance.robots.catalogue import find_robot
 from mjx_balance.sim.scene import Scene, load_scene
-from mjx_balance.task.observation import observation_names
 from mjx_balance.task.pushes import Pushes
 from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.tilt import Scenario

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.fleet import observation_names
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,7 +20,6 @@ from mjx_balance.task.observation import (
     extend_history,
     input_rows,
     lookback,
-    observation_names,
     observe,
 )
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from fixtures.fleet import observation_names
 
 from mjx_balance.config import Config
 from mjx_balance.envs.batch import Episodes
@@ -13,7 +14,7 @@ from mjx_balance.evaluation.suites import draw_suite
 from mjx_balance.robots.catalogue import Robot
 from mjx_balance.sim.scene import Scene
 from mjx_balance.task.actions import action_table, apply_action
-from mjx_balance.task.observation import observation_names
+from mjx_balance.task.observation import input_rows
 from mjx_balance.task.randomization import DomainParams
 from mjx_balance.task.symmetry import Symmetries, symmetries
 from mjx_balance.task.tilt import Scenario
@@ -50,7 +51,7 @@ def test_the_identity_and_one_mirror_that_is_its_own_inverse(
 ) -> None:
     """Front-hind is none: all knees bend backward (0.024 deg in the stance, 5% in motion)."""
     group = symmetries(any_config.task, robot)
-    size = len(observation_names(any_config.task, robot))
+    size = len(input_rows(any_config.task, robot))
     obs, actions = np.arange(1.0, size + 1), np.arange(441)
     assert group.obs_index.shape == group.obs_sign.shape == (2, size)
     np.testing.assert_array_equal(group.obs_index[0], range(size))

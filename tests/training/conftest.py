@@ -21,7 +21,7 @@ from mjx_balance.dqn import QNetwork
 from mjx_balance.files.run_folder import RunFolder
 from mjx_balance.report.progress import Display
 from mjx_balance.robots.catalogue import find_robot
-from mjx_balance.task.observation import observation_names
+from mjx_balance.task.observation import input_rows
 from mjx_balance.training.loop import Run
 
 REPO = Path(__file__).parents[2]
@@ -120,7 +120,7 @@ class StubLearner:
     def __init__(self) -> None:
         config = preset("smoke")
         self.network = QNetwork(config.dqn.hidden_sizes, (21, 21), radial=True)
-        self.obs_size = len(observation_names(config.task, find_robot(config.robot)))
+        self.obs_size = len(input_rows(config.task, find_robot(config.robot)))
         init = jax.jit(self.network.init)
         self.params: Any = init(jax.random.PRNGKey(0), jnp.zeros(self.obs_size))
         self.first_weight = float(self.params["params"]["hidden_0"]["kernel"].ravel()[0])
