@@ -348,24 +348,35 @@ class Controller:
           ValueError: if an array of the first sample has another shape; later ones make it hold.
         """
         ended = self.state in (State.HOLDING, State.DAMPING)
+        sensors = joint_positions, gyro, accelerometer
+        if not ended:
+            self._guard(self._process, sensors, quaternion, torques, temperatures)
+        elif self._obeyed:  # each alone: a bad reading hides no fall that another one shows
+            self._guard(self._check_tilt, quaternion)
+            self._guard(self._watch, accelerometer)
+        if self.fault is not Fault.NONE and not ended:
+            self._record(start=False)
+        return self._targets.copy()
+
+    def _guard(self, check: Callable[..., None], *arguments: Any) -> None:
+        """Calls a check; after a fault it holds or damps, or stays PASSIVE."""
         try:
-            self._read_sensors(joint_positions, gyro, accelerometer)
-            if self.state is State.PASSIVE:
-                self._check_reading()
-                self._targets = self._pose()
-                self.reason = ""
-            elif not ended:
-                self._take(self._time(), quaternion, torques, temperatures)
-            elif self._obeyed:
-                self._watch(quaternion)
+            check(*arguments)
         except _Unsafe as unsafe:
             if self.state is State.PASSIVE:
                 self.reason = _line(unsafe, MOST_MESSAGE)
             else:
                 self._stop(unsafe.fault, str(unsafe))
-        if self.fault is not Fault.NONE and not ended:
-            self._record(start=False)
-        return self._targets.copy()
+
+    def _process(self, sensors: Any, *others: Any) -> None:
+        """Processes a sample of a controller that neither holds nor damps."""
+        self._read_sensors(*sensors)
+        if self.state is State.PASSIVE:
+            self._check_reading()
+            self._targets = self._pose()
+            self.reason = ""
+        else:
+            self._take(self._time(), *others)
 
     def _stop(self, fault: Fault, reason: str) -> None:
         """Holds or damps; who holds may still damp."""
@@ -404,8 +415,7 @@ class Controller:
         """Checks a call's readings; every `_per_sample` calls are a sample of the policy."""
         last, self._called = self._called, now
         self._check_reading()
-        if quaternion is not None:
-            self._check_tilt(quaternion)
+        self._check_tilt(quaternion)
         first = self._way is None and self.state is not State.BALANCING
         if not first:
             self._check_time(now - last)
@@ -499,12 +509,12 @@ class Controller:
         joints = np.clip(self._reading[:-IMU], self.model.least[:-IMU], self.model.most[:-IMU])
         return joints.reshape(-1, 3)
 
-    def _watch(self, quaternion: Any) -> None:
-        """Checks that a robot that is HOLDING has not fallen."""
-        self._check_reading()
-        if quaternion is not None:
-            self._check_tilt(quaternion)
-        self._sum += self._reading[-IMU:]
+    def _watch(self, accelerometer: Any) -> None:
+        """Checks that a robot that is HOLDING has not fallen; skips impossible readings."""
+        values = _numeric("accelerometer", accelerometer).astype(float)
+        if values.shape != (3,) or not (abs(values) <= ACCEL_MOST).all():
+            return
+        self._sum[3:] += values
         self._calls += 1
         if self._calls == self.decision_samples * self._per_sample:
             accel = (self._sum[3:] / self._calls).tolist()
@@ -645,7 +655,9 @@ class Controller:
             )
 
     def _check_tilt(self, quaternion: Any) -> None:
-        """Checks a quaternion for a robot that lies."""
+        """Checks a quaternion, if given, for a robot that lies."""
+        if quaternion is None:
+            return
         values = _numeric("quaternion", quaternion)
         norm = math.hypot(*map(float, values)) if values.shape == (4,) else math.nan
         if not abs(norm - 1) <= NORM_ERROR:

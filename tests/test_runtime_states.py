@@ -348,6 +348,41 @@ def test_who_holds_keeps_the_gains_and_still_notices_a_fall(rig: Rig) -> None:
     np.testing.assert_array_equal(np.asarray(controller.stiffness), np.zeros((4, 3)))
 
 
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"joint_positions": np.full((4, 3), math.nan)},
+        {"joint_positions": None},
+        {"gyro": [0, 0, math.nan]},
+        {"gyro": [0]},
+        {"quaternion": [0, 0, 0, 0]},
+        {"accelerometer": [0, 0, math.nan], "quaternion": [0.7071, 0.7071, 0, 0]},
+        {"accelerometer": None, "quaternion": [0.7071, 0.7071, 0, 0]},
+    ],
+    ids=str,
+)
+def test_a_bad_reading_hides_no_fall_from_who_holds(bad: dict[str, Any], rig: Rig) -> None:
+    """A cable breaks, and the robot holds. Then it lies on its side, as another sensor says."""
+    rig.stand()
+    first: dict[str, Any] = {"quaternion": [0, 0, 0, 0]} if "quaternion" in bad else bad
+    side: dict[str, Any] = {"accelerometer": [0, 9.81, 0]}
+    rig.step(**first)
+    assert (rig.controller.state, rig.controller.fault) == (State.HOLDING, Fault.READING)
+    rig.step(60, **first)
+    assert rig.controller.state is State.HOLDING
+    rig.step(101, **(side | bad))
+    assert rig.controller.state is State.DAMPING
+    assert rig.controller.fault is (Fault.TILT if "accelerometer" in bad else Fault.LEAN)
+
+
+def test_impossible_accelerations_count_for_no_fall(rig: Rig) -> None:
+    """One in two readings of an upright robot is upside down and beyond the sensor's range."""
+    rig.controller.hold("a look")
+    for k in range(200):
+        rig.step(accelerometer=[0, 0, -161.0 if k % 2 else 9.81])
+    assert rig.controller.state is State.HOLDING
+
+
 def test_damp_and_hold_from_anywhere() -> None:
     for steps in (0, 1, 300, 2000):
         for gains in (True, False):

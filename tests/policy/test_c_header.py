@@ -288,6 +288,25 @@ def test_every_fault_has_its_code_state_and_sentence(
     assert all(0 < len(x) < 100 for x in sentences[1:])
 
 
+@pytest.mark.parametrize("sensor", ["joints", "gyro", "quaternion", "accelerometer"])
+def test_a_bad_reading_hides_no_fall_in_either(sensor: str, build_shipped: Any) -> None:
+    """It holds, for good without a number from a sensor; then the robot lies on its side."""
+    pair = Pair(SHIPPED["best"], build_shipped(SHIPPED["best"]), True)
+    pair.act("hold")
+    sample: dict[str, Any] = {
+        "joints": pair.python.targets,
+        "gyro": [0, 0, 0],
+        "accelerometer": [0, 0, 9.81],
+        "quaternion": [1, 0, 0, 0],
+    }
+    side: dict[str, Any] = {"accelerometer": [0, 9.81, 0], "quaternion": [0.7071, 0.7071, 0, 0]}
+    broken: dict[str, Any] = {sensor: np.full(np.shape(sample[sensor]), math.nan)}
+    for k in range(200):
+        pair.step(**(sample | (side if k > 70 else {}) | broken))
+        assert (pair.c.state is State.DAMPING) == (k >= (99 if sensor == "quaternion" else 71))
+    assert pair.c.fault is (Fault.LEAN if sensor == "quaternion" else Fault.TILT)
+
+
 def test_samples_in_bursts_hold_at_the_second_decision(trimmed: tuple[Path, Any]) -> None:
     """The last 20 of each decision's 50 samples are the same; a decision between them is whole."""
     for gaps, holds in (((1, 1), True), ((1, 0, 1), False)):
