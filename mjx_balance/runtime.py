@@ -276,6 +276,7 @@ class Controller:
         self._since = self._seen = self._gaps = self._risen = 0
         self._called = self._decided = math.nan
         self._way: _Way | None = None
+        self._follow = False  # the targets are not yet those of a robot that lies
         # Shares of stiffness and feed-forward torque, and whether the servos damp.
         self._stiff = self._loaded = 0.0 if self._obeyed else 1.0
         self._damped = not self._obeyed
@@ -288,9 +289,12 @@ class Controller:
         The stiffness rises in `GAIN_RISE_S`. Then the feet move under the hips, and the legs lift
         the trunk to its standing height. Balancing begins when the robot is still: no gyro
         reading of a decision's samples is above `STILL_RATE`.
+
+        Without `gains`, send no targets before the next sample: they are not those of its pose.
         """
         if self.state in (State.PASSIVE, State.STANDING):
             self.state, self.reason, self._damped = State.STANDING_UP, "", True
+            self._follow = not self._obeyed
 
     def hold(self, reason: str) -> None:
         """Holds targets and gains until `reset`; does nothing if it already holds or damps."""
@@ -345,13 +349,13 @@ class Controller:
           (legs, 3) joint position targets, rad.
 
         Raises:
-          ValueError: if an array of the first sample has another shape; later ones make it hold.
+          ValueError: without `gains`, if an array of the first sample has another shape; later ones
+            make it hold.
         """
         ended = self.state in (State.HOLDING, State.DAMPING)
         sensors = joint_positions, gyro, accelerometer
-        if not ended:
-            self._guard(self._process, sensors, quaternion, torques, temperatures)
-        elif self._obeyed:  # each alone: a bad reading hides no fall that another one shows
+        self._guard(self._process, sensors, quaternion, torques, temperatures)
+        if ended and self._obeyed:  # each alone: a bad reading hides no fall that another one shows
             self._guard(self._check_tilt, quaternion)
             self._guard(self._watch, accelerometer)
         if self.fault is not Fault.NONE and not ended:
@@ -369,13 +373,15 @@ class Controller:
                 self._stop(unsafe.fault, str(unsafe))
 
     def _process(self, sensors: Any, *others: Any) -> None:
-        """Processes a sample of a controller that neither holds nor damps."""
+        """Reads a sample, and processes it if the controller neither holds nor damps."""
         self._read_sensors(*sensors)
+        if self._follow:
+            self._place()
         if self.state is State.PASSIVE:
             self._check_reading()
-            self._targets = self._pose()
+            self._place()
             self.reason = ""
-        else:
+        elif self.state not in (State.HOLDING, State.DAMPING):
             self._take(self._time(), *others)
 
     def _stop(self, fault: Fault, reason: str) -> None:
@@ -396,7 +402,7 @@ class Controller:
                 f"joint_positions, gyro and accelerometer have shapes {shapes[0]}, {shapes[1]} "
                 f"and {shapes[2]}; they must be {self._targets.shape}, (3,) and (3,)"
             )
-            if self.state is State.STANDING:
+            if self.state is State.STANDING or (self.state is State.STANDING_UP and self._follow):
                 raise ValueError(sentence)
             raise _Unsafe(Fault.READING, sentence)
         np.concatenate((joints.ravel(), gyro, accel), out=self._reading)
@@ -504,6 +510,12 @@ class Controller:
         crouch = self.model.legs.joint_angles(np.full(len(pose), height))
         return _Way(pose, crouch, self._path[0], self.sample_dt)
 
+    def _place(self) -> None:
+        """Makes the joints' readings the targets, where they are possible."""
+        possible = self._possible()[:-IMU]
+        self._targets = np.where(possible.reshape(-1, 3), self._pose(), self._targets)
+        self._follow = not possible.all()
+
     def _pose(self) -> np.ndarray:
         """Joint angles (legs, 3), rad, of which a target may be made: within their range."""
         joints = np.clip(self._reading[:-IMU], self.model.least[:-IMU], self.model.most[:-IMU])
@@ -533,13 +545,22 @@ class Controller:
             )
         )
 
-    def _check_reading(self) -> None:
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest possible readings now."""
         stands = self.state in (State.STANDING, State.BALANCING)
         more = 0.0 if stands else self.model.lying
-        least, most = self.model.least - more, self.model.most + more
-        sane = (least <= self._reading) & (self._reading <= most)  # NaN is not
-        k = int(sane.argmin())
-        if not sane[k]:
+        return self.model.least - more, self.model.most + more
+
+    def _possible(self) -> np.ndarray:
+        """Whether each reading is a number within its bounds."""
+        least, most = self._bounds()
+        return (least <= self._reading) & (self._reading <= most)  # NaN is not
+
+    def _check_reading(self) -> None:
+        possible = self._possible()
+        k = int(possible.argmin())
+        if not possible[k]:
+            least, most = self._bounds()
             raise _Unsafe(
                 Fault.READING,
                 f"{self._name(k)} reads {self._reading[k]:.3g}, which is not between "

@@ -242,6 +242,65 @@ def test_stand_works_without_gains_too(rig: Rig) -> None:
     assert rig.controller.state is State.BALANCING
 
 
+@pytest.mark.parametrize(
+    "readings",
+    [
+        {"quaternion": [0.7071, 0.7071, 0, 0]},
+        {"quaternion": [0, 0, 0, 0]},
+        {"accelerometer": [0, 9.81, 0]},
+        {"gyro": [0, math.nan, 0]},
+        {"torques": [1, 2]},
+    ],
+    ids=str,
+)
+def test_a_fault_at_the_first_sample_moves_no_leg(readings: dict[str, Any]) -> None:
+    """Position servos, and a robot that lies: a target beyond its own pose would make it jump."""
+    rig = Rig(gains=False)
+    rig.controller.stand()
+    np.testing.assert_array_equal(rig.step(**readings), CROUCH)
+    assert rig.controller.state is State.HOLDING
+    np.testing.assert_array_equal(rig.step(joint_positions=0.9 * CROUCH), CROUCH)
+
+
+def test_a_clock_without_time_at_the_first_sample_moves_no_leg() -> None:
+    controller = Controller(BEST, lambda: 1 / 0)
+    controller.stand()
+    targets = controller.step(CROUCH, np.zeros(3), np.asarray([0, 0, 9.81]))
+    assert controller.fault is Fault.CLOCK
+    np.testing.assert_array_equal(targets, CROUCH)
+
+
+@pytest.mark.parametrize("act", ["hold", "damp"])
+def test_a_button_before_the_first_sample_moves_no_leg(act: str) -> None:
+    rig = Rig(gains=False)
+    rig.controller.stand()
+    getattr(rig.controller, act)("the button")
+    np.testing.assert_array_equal(rig.step(), CROUCH)
+    np.testing.assert_array_equal(rig.step(joint_positions=0.9 * CROUCH), CROUCH)
+
+
+def test_a_joint_without_a_reading_at_first_waits_for_one() -> None:
+    """All others stay where they are; it goes to its standing angle until it reads a number."""
+    rig, expected = Rig(gains=False), CROUCH.copy()
+    rig.controller.stand()
+    expected[2, 1] = joint_angles(ROBOT, np.full(4, 0.35))[2, 1]
+    first = np.where(expected == CROUCH, CROUCH, math.nan)
+    np.testing.assert_array_equal(rig.step(joint_positions=first), expected)
+    assert (rig.controller.state, rig.controller.fault) == (State.HOLDING, Fault.READING)
+    np.testing.assert_array_equal(rig.step(joint_positions=CROUCH), CROUCH)
+    np.testing.assert_array_equal(rig.step(joint_positions=expected), CROUCH)
+
+
+def test_without_gains_a_first_sample_of_another_shape_is_refused() -> None:
+    """Whether it stands or stands up: there are no targets that are safe."""
+    for acts in ((), ("stand",)):
+        rig = Rig(gains=False)
+        for act in acts:
+            getattr(rig.controller, act)()
+        with pytest.raises(ValueError, match="have shapes"):
+            rig.step(joint_positions=np.zeros(12))
+
+
 def far(rig: Rig) -> np.ndarray:
     """Joints of which one is 0.6 rad from its target."""
     joints = rig.controller.targets

@@ -307,6 +307,28 @@ def test_a_bad_reading_hides_no_fall_in_either(sensor: str, build_shipped: Any) 
     assert pair.c.fault is (Fault.LEAN if sensor == "quaternion" else Fault.TILT)
 
 
+@pytest.mark.parametrize("kind", ["tilt", "gyro", "joint", "hold"])
+def test_a_fault_at_the_first_sample_moves_no_leg_in_either(kind: str, build_shipped: Any) -> None:
+    """Position servos, and a robot that lies; a joint without a reading waits for one."""
+    pair = Pair(SHIPPED["best"], build_shipped(SHIPPED["best"]), False)
+    standing, nan = pair.python.targets, math.nan
+    lying = (standing + np.tile([0.0, 0.3, -0.4], (4, 1))).astype(np.float32)
+    first, gyro = lying.copy(), [0.0, nan if kind == "gyro" else 0.0, 0.0]
+    quaternion = [0.7071, 0.7071, 0, 0] if kind == "tilt" else [1, 0, 0, 0]
+    if kind == "joint":
+        first[1, 2] = nan
+    pair.act("stand")
+    if kind == "hold":
+        pair.act("hold")
+    pair.step(first, gyro, [0, 0, 9.81], quaternion=quaternion)
+    assert pair.c.state is State.HOLDING
+    expected = np.where(np.isnan(first), standing, lying)
+    np.testing.assert_allclose(pair.c.targets, expected, rtol=0, atol=1e-6)
+    pair.step(lying, [0, 0, 0], [0, 0, 9.81])
+    pair.step(standing, [0, 0, 0], [0, 0, 9.81])
+    np.testing.assert_allclose(pair.c.targets, lying, rtol=0, atol=1e-6)
+
+
 def test_samples_in_bursts_hold_at_the_second_decision(trimmed: tuple[Path, Any]) -> None:
     """The last 20 of each decision's 50 samples are the same; a decision between them is whole."""
     for gaps, holds in (((1, 1), True), ((1, 0, 1), False)):
