@@ -1122,8 +1122,11 @@ def _read(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             raise PolicyFileError(f"its manifest has {len(text)} characters, too many")
         if len(header) > MOST_WEIGHTS:
             raise PolicyFileError(f"it has {len(header)} weights, more than {MOST_WEIGHTS}")
-        ends = [entry["data_offsets"] for entry in header.values()]
-        if sum(end - begin for begin, end in ends) != len(numbers):  # before anything is copied
+        places = {name: entry["data_offsets"] for name, entry in header.items()}
+        for name, (begin, end) in places.items():  # before anything is copied
+            if not 0 <= begin <= end <= len(numbers):
+                raise ValueError(f"weight {_quote(name)} lies outside the file")
+        if sum(end - begin for begin, end in places.values()) != len(numbers):
             raise ValueError("its length is not that of its weights")
         weights = {name: _array(name, entry, numbers) for name, entry in header.items()}
     except PolicyFileError:
@@ -1164,8 +1167,6 @@ def _array(name: str, entry: dict[str, Any], numbers: memoryview) -> np.ndarray:
         kind = _line(entry["dtype"], 40)
         raise PolicyFileError(f"weight {_quote(name)} is {kind}; it must be F32 (float32)")
     begin, end = entry["data_offsets"]
-    if not 0 <= begin <= end <= len(numbers):
-        raise ValueError(f"weight {_quote(name)} lies outside the file")
     return np.frombuffer(numbers[begin:end], "<f4").astype(np.float32).reshape(entry["shape"])
 
 

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -185,6 +186,22 @@ def test_weights_that_lie_over_each_other_are_refused_before_they_are_copied(
     start = time.process_time()
     assert_refused(reader, scratch, "damaged or no safetensors file")
     assert time.process_time() - start < 1
+
+
+@by_both
+def test_a_weight_of_negative_length_makes_no_room_for_others(reader: str, scratch: Path) -> None:
+    """Lengths whose sum is the file's: seven weights of all 50 MiB, the last from its end back."""
+    size, weights = 50 * 2**20, 7
+    entry = {"dtype": "F32", "shape": [size // 4], "data_offsets": [0, size]}
+    header: dict[str, Any] = {f"w{k}": entry for k in range(weights)}
+    header["last"] = {**entry, "data_offsets": [(weights - 1) * size, 0]}
+    scratch.write_bytes(packed({"__metadata__": {"manifest": "{}"}, **header}, bytes(size)))
+    tracemalloc.start()
+    try:
+        assert_refused(reader, scratch, "damaged or no safetensors file")
+        assert tracemalloc.get_traced_memory()[1] < 3 * size, "the file alone is read twice at most"
+    finally:
+        tracemalloc.stop()
 
 
 @by_both
