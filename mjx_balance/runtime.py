@@ -705,6 +705,13 @@ class Controller:
                 f"{LOADS[kind]} has shape {_line(array.shape, 40)}; it must be "
                 f"{self._targets.shape}",
             )
+        finite = np.isfinite(array).ravel()
+        k = int(finite.argmin())
+        if not finite[k]:
+            raise _Unsafe(
+                Fault.READING,
+                f"{LOADS[kind]} of {self._name(k)} are {array.flat[k]}; they must be finite",
+            )
         self._loads[kind] += abs(array.ravel())
         self._load_counts[kind] += 1
 
@@ -714,7 +721,7 @@ class Controller:
         means, faults = self._loads / counts, (Fault.TORQUE, Fault.TEMPERATURE)
         self._loads, self._load_counts = np.zeros_like(self._loads), [0, 0]
         for mean, most, name, unit, fault in zip(means, self._most_loads, LOADS, UNITS, faults):
-            sane = mean <= most  # NaN is not
+            sane = mean <= most
             k = int(sane.argmin())
             if not sane[k]:
                 raise _Unsafe(

@@ -338,11 +338,18 @@ FAULTS: dict[str, tuple[int, Callable[[Rig], dict[str, Any]], Fault, str]] = {
         *(Fault.TORQUE, r"torques of RF_knee are 43.2 N m .* more than 43.1"),
     ),
     "strained hip": (50, lambda r: {"torques": STRAINED_HIP}, Fault.TORQUE, "RF_hip .* than 22.5"),
-    "no torque": (50, lambda r: {"torques": np.full((4, 3), np.nan)}, Fault.TORQUE, "nan N m"),
+    "no torque": (
+        *(1, lambda r: {"torques": np.where(STRAINED, np.nan, 0.0)}),
+        *(Fault.READING, "torques of RF_knee are nan; they must be finite"),
+    ),
+    "no end of heat": (
+        *(1, lambda r: {"temperatures": np.where(STRAINED, np.inf, 0.0)}),
+        *(Fault.READING, "temperatures of RF_knee are inf; they must be finite"),
+    ),
     "two torques": (1, lambda r: {"torques": [1, 2]}, Fault.READING, r"\(2,\); it must be"),
 }
 DAMPS = {"lifted", "on its side", "falling", "blocked", "upside down", "hot", "strained"}
-DAMPS |= {"strained hip", "no torque"}
+DAMPS |= {"strained hip"}
 
 
 @pytest.mark.parametrize("gains", [True, False])
@@ -379,6 +386,15 @@ def test_a_fault_leads_to_its_state(name: str, gains: bool) -> None:
     controller.reset()
     assert (controller.fault, controller.reason) == (Fault.NONE, "")
     assert controller.state is (State.PASSIVE if gains else State.STANDING)
+
+
+def test_who_sets_no_limit_still_needs_temperatures_that_are_numbers(rig: Rig) -> None:
+    """A broken thermometer is a reading, not heat: the robot holds and does not sink."""
+    rig.stand()
+    rig.step(60, temperatures=np.full((4, 3), 1e6))
+    assert rig.controller.state is State.BALANCING
+    rig.step(temperatures=np.full((4, 3), np.nan))
+    assert (rig.controller.state, rig.controller.fault) == (State.HOLDING, Fault.READING)
 
 
 def test_the_page_has_the_table_of_faults() -> None:

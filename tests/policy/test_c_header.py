@@ -329,6 +329,22 @@ def test_a_fault_at_the_first_sample_moves_no_leg_in_either(kind: str, build_shi
     np.testing.assert_allclose(pair.c.targets, lying, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("load", ["torques", "temperatures"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_load_that_is_no_number_holds_in_both(
+    load: str, value: float, build_shipped: Any
+) -> None:
+    """At once, and at its joint; a fault of the servo itself would damp."""
+    pair = Pair(SHIPPED["best"], build_shipped(SHIPPED["best"]), True)
+    values: dict[str, Any] = {load: np.where(np.arange(12).reshape(4, 3) == 7, value, 0.0)}
+    pair.act("stand")
+    play(pair, "still", 20, 0)
+    pair.step(pair.python.targets, [0, 0, 0], [0, 0, 9.81], **values)
+    assert (pair.c.state, pair.c.fault) == (State.HOLDING, Fault.READING)
+    assert pair.c._values[2] == 7
+    np.testing.assert_equal(pair.c._values[3], value)
+
+
 def test_samples_in_bursts_hold_at_the_second_decision(trimmed: tuple[Path, Any]) -> None:
     """The last 20 of each decision's 50 samples are the same; a decision between them is whole."""
     for gaps, holds in (((1, 1), True), ((1, 0, 1), False)):
