@@ -307,7 +307,8 @@ class Controller:
     def save_log(self, path: str | os.PathLike[str]) -> None:
         """Writes the last 60 s to a file, as .npz; `mjx-balance replay` reads it.
 
-        It ends with the sample that led to HOLDING or DAMPING, and holds the policy file.
+        It ends with the sample that led to HOLDING, or to DAMPING, if need be after HOLDING; and it
+        holds the policy file.
 
         Raises:
           OSError: if it cannot be written; an old file then stays.
@@ -352,13 +353,14 @@ class Controller:
           ValueError: without `gains`, if an array of the first sample has another shape; later ones
             make it hold.
         """
-        ended = self.state in (State.HOLDING, State.DAMPING)
+        before = self.state
         sensors = joint_positions, gyro, accelerometer
         self._guard(self._process, sensors, quaternion, torques, temperatures)
-        if ended and self._obeyed:  # each alone: a bad reading hides no fall that another one shows
+        if self._obeyed and before in (State.HOLDING, State.DAMPING):
+            # Each alone: a bad reading hides no fall that another one shows.
             self._guard(self._check_tilt, quaternion)
             self._guard(self._watch, accelerometer)
-        if self.fault is not Fault.NONE and not ended:
+        if self.fault is not Fault.NONE and self.state is not before:
             self._record(start=False)
         return self._targets.copy()
 
@@ -381,7 +383,9 @@ class Controller:
             self._check_reading()
             self._place()
             self.reason = ""
-        elif self.state not in (State.HOLDING, State.DAMPING):
+        elif self.state in (State.HOLDING, State.DAMPING):
+            self._called = self._time()
+        else:
             self._take(self._time(), *others)
 
     def _stop(self, fault: Fault, reason: str) -> None:

@@ -80,6 +80,27 @@ def test_a_log_ends_with_the_sample_of_the_fault(recorded: Recorded) -> None:
     assert str(log["reason"]).startswith("gyro y reads nan")
 
 
+def test_a_log_ends_with_the_fall_of_a_robot_that_holds(
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One sample more: its time, sensors, state and fault fit the reason."""
+    controller = recorded.controller
+    joints, accel = controller.targets, np.asarray([0, 9.81, 0])
+    controller.step(joints, np.asarray([0, np.nan, 0]), np.asarray([0, 0, 9.81]))
+    for _ in range(99):
+        recorded.now += 0.004
+        controller.step(joints, np.zeros(3), accel)
+    log = read_log(recorded.save())
+    assert log["fault"][-3:].tolist() == [Fault.NONE, Fault.READING, Fault.LEAN]
+    codes = [list(State).index(state) for state in (State.HOLDING, State.DAMPING)]
+    assert log["state"][-2:].tolist() == codes
+    np.testing.assert_array_equal(log["accelerometer"][-1], accel)
+    assert log["time"][-1] - log["time"][-2] == pytest.approx(50 * 0.004), "a decision's samples"
+    assert str(log["reason"]).startswith("the accelerometer leans")
+    assert main(["replay", str(recorded.path), "--out", str(tmp_path / "r.png")]) == 0
+    assert "it ended damping, fault LEAN: the accelerometer leans" in capsys.readouterr().out
+
+
 def test_the_oldest_samples_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a log of 0.4 s, 100 samples are left: the last ones, in order."""
     monkeypatch.setattr(runtime, "LOG_S", 0.4)
