@@ -413,9 +413,12 @@ class Controller:
 
     def _time(self) -> float:
         try:
-            return float(self._clock())
+            now = float(self._clock())
         except Exception as error:  # whatever a clock raises, the legs stay where they are
             raise _Unsafe(Fault.CLOCK, f"the clock gives no time: {error}") from error
+        if not math.isfinite(now):
+            raise _Unsafe(Fault.CLOCK, f"the clock gives no time: it gives {now} s")
+        return now
 
     def _begin_sample(self) -> None:
         """Forgets the calls since the policy's last sample."""

@@ -295,7 +295,8 @@ def bent(value: float) -> np.ndarray:
         ({"accel": [-math.inf, 0, 9.81]}, "accelerometer x reads -inf"),
         ({"after": 0.021}, r"a sample came 0.021 s after .* within 0.02 s"),
         ({"after": -0.004}, r"a sample came -0.004 s after"),
-        ({"after": math.nan}, r"a sample came nan s after"),
+        ({"after": math.nan}, "the clock gives no time: it gives nan s"),
+        ({"after": math.inf}, "the clock gives no time: it gives inf s"),
     ],
 )
 @pytest.mark.parametrize("at", [52, 100])
@@ -668,7 +669,10 @@ def raises() -> float:
     raise RuntimeError("no\x1b[2J clock")
 
 
-@pytest.mark.parametrize("clock", [raises, lambda: None, lambda: "noon", lambda: 10**400])
+@pytest.mark.parametrize(
+    "clock",
+    [raises, lambda: None, lambda: "noon", lambda: 10**400, lambda: math.nan, lambda: -math.inf],
+)
 def test_a_clock_that_gives_no_time_makes_it_hold(clock: Callable[[], Any]) -> None:
     controller = Controller(BEST, clock)
     standing = controller.targets

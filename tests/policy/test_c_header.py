@@ -235,7 +235,7 @@ def test_it_does_what_the_runtime_does_whatever_happens(
         play(pair, *segment)
 
 
-@pytest.mark.parametrize("fault", [x for x in Fault if x not in (Fault.NONE, Fault.CLOCK)])
+@pytest.mark.parametrize("fault", [x for x in Fault if x is not Fault.NONE])
 def test_every_fault_has_its_code_state_and_sentence(
     fault: Fault, build_shipped: Any, trimmed: tuple[Path, Any], tmp_path: Path
 ) -> None:
@@ -254,6 +254,8 @@ def test_every_fault_has_its_code_state_and_sentence(
         play(pair, "still", 600, 2)
     elif fault in (Fault.HELD, Fault.DAMPED):
         pair.act("hold" if fault is Fault.HELD else "damp")
+    elif fault is Fault.CLOCK:
+        pair.step(pair.python.targets, [0, 0, 0], [0, 0, 9.81], math.inf)
     elif fault is Fault.RATE:
         for k in range(150):
             pair.step(pair.python.targets, [0, 0, 1e-4 * k], [0, 0, 9.81], 1.2)
@@ -343,6 +345,14 @@ def test_a_load_that_is_no_number_holds_in_both(
     assert (pair.c.state, pair.c.fault) == (State.HOLDING, Fault.READING)
     assert pair.c._values[2] == 7
     np.testing.assert_equal(pair.c._values[3], value)
+
+
+@pytest.mark.parametrize("now", [math.nan, -math.inf])
+def test_a_first_sample_without_a_time_holds_in_both(now: float, build_shipped: Any) -> None:
+    pair = Pair(SHIPPED["best"], build_shipped(SHIPPED["best"]), False)
+    pair.now = now
+    pair.step(pair.python.targets, [0, 0, 0], [0, 0, 9.81])
+    assert (pair.c.state, pair.c.fault) == (State.HOLDING, Fault.CLOCK)
 
 
 def test_samples_in_bursts_hold_at_the_second_decision(trimmed: tuple[Path, Any]) -> None:
