@@ -12,8 +12,8 @@ to the targets, as the simulation adds `scene.stance.leg_trim`; servos with an i
 none.
 
 The controller holds when a reading is impossible, or when the robot no longer balances: the targets
-then stay the same until `reset`. The robot must be back at its standing height before `reset`. The
-servos need a watchdog in case the loop stops.
+then stay the same until `reset`. The robot must be back at its standing height before `reset`; with
+`gains`, below, it must lie. The servos need a watchdog in case the loop stops.
 
 Servos whose gains can be set let the robot stand up from where it lies, and lie down softly after
 a fall::
@@ -263,7 +263,8 @@ class Controller:
     def reset(self) -> None:
         """Starts again in state STANDING, or PASSIVE if the servos obey the gains.
 
-        In state STANDING the robot must stand still at its standing height.
+        In state STANDING the robot must stand still at its standing height. PASSIVE has no gains: a
+        robot that stands drops. First `damp` it until it lies.
         """
         self.state = State.PASSIVE if self._obeyed else State.STANDING
         self.fault = Fault.NONE  #: why it is HOLDING or DAMPING
