@@ -4,7 +4,6 @@ import dataclasses
 import io
 import tempfile
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -105,11 +104,11 @@ def read_log(path: Path) -> Log:
             log = {name: _read_array(archive, name) for name in (*OTHERS, *SHAPES)}
         _check(log)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
     except (ValueError, KeyError, SyntaxError, RuntimeError, zipfile.BadZipFile) as error:
         text = shorten(str(error), MESSAGE // 2)
         raise InputError(f"{path} is damaged or no log of a controller: {text}") from error
-    except (NotImplementedError, EOFError, zlib.error) as error:
+    except Exception as error:  # damage makes zipfile, its decompressors and NumPy raise anything
         raise InputError(f"{path} is damaged or no log of a controller") from error
     return log
 

@@ -186,6 +186,21 @@ def raw(path: Path, name: str, content: bytes) -> None:
             archive.writestr(item, content if item == f"{name}.npy" else old)
 
 
+def garbage(path: Path, kind: int) -> None:
+    """Compresses an array another way, and makes what is compressed unreadable."""
+    with zipfile.ZipFile(path) as archive:
+        kept = {item: archive.read(item) for item in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for item, old in kept.items():
+            archive.writestr(item, old, kind if item == "time.npy" else zipfile.ZIP_STORED)
+        info = archive.getinfo("time.npy")
+    # A local header has 30 bytes and the name; LZMA's properties take 9 more.
+    start = info.header_offset + 30 + len("time.npy") + 9
+    content = bytearray(path.read_bytes())
+    content[start : start + 16] = bytes(16 * [255])
+    path.write_bytes(content)
+
+
 def header(text: str) -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
 
@@ -208,6 +223,14 @@ HOSTILE: dict[str, Any] = {
     "object": lambda path: raw(path, "time", PICKLE.getvalue()),
     "huge": lambda path: raw(path, "time", HUGE),
     "code": lambda path: raw(path, "time", header("__import__('os').abort()\n")),
+    "open bracket": lambda path: raw(path, "time", header("{'descr': '<f8', 'shape': (")),
+    "no type": lambda path: raw(
+        path, "time", header("{'descr': (), 'fortran_order': False, 'shape': (1,), }\n")
+    ),
+    "list as a key": lambda path: raw(path, "time", header("{[]: 1}\n")),
+    "deep": lambda path: raw(path, "time", header(400 * "(")),
+    "lzma": lambda path: garbage(path, zipfile.ZIP_LZMA),
+    "bz2": lambda path: garbage(path, zipfile.ZIP_BZIP2),
     "no array": lambda path: raw(path, "time", b"\x93NUMPY"),
     "another policy": lambda path: changed(path, policy=np.zeros(9, np.uint8)),
     "no samples": lambda path: changed(
@@ -230,6 +253,7 @@ def test_a_damaged_log_is_refused_in_a_sentence(
     error = capsys.readouterr().err
     assert len(error.splitlines()) == 1
     assert len(error) < 450
+    assert "None" not in error
     assert not out.exists()
 
 
