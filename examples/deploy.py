@@ -37,7 +37,8 @@ def main() -> None:
     boards = draw_suite(scene.task, scene.robot, "corner", 1, SECONDS, seed=0).scenario
     controller = Controller(path, clock=lambda: data.time)
     delay = round(scene.robot.command_delay / task.sim_dt)  # physics steps until the servos obey
-    commands: deque[np.ndarray] = deque(maxlen=1 + delay)
+    standing = controller.targets + stance.leg_trim
+    commands: deque[np.ndarray] = deque([standing] * delay, maxlen=1 + delay)
     tilts = []
     while data.time < SECONDS:
         gyro, accelerometer = np.split(data.sensordata[scene.imu], 2)

@@ -8,6 +8,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -770,6 +771,31 @@ def test_the_examples_servos_obey_as_late_as_the_robots(
     main()
     mean, greatest = map(float, re.findall(r"[\d.]+(?= deg)", capsys.readouterr().out))
     assert (mean, greatest) == pytest.approx((tilt.mean(), tilt.max()), abs=6e-4)
+
+
+def test_the_examples_servos_obey_after_their_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spot's: a physics step. Until then they hold the standing pose, as in the evaluation."""
+    example = runpy.run_path(str(REPO / "examples/deploy.py"))
+    monkeypatch.setattr(sys, "argv", ["deploy.py", "spot"])
+    commands, targets, step = [], [], Controller.step
+
+    def mj_step(model: Any, data: Any) -> None:
+        commands.append(data.ctrl.copy())
+        mujoco.mj_step(model, data)
+
+    def record(self: Controller, *sensors: Any) -> np.ndarray:
+        targets.append(self.targets)
+        return step(self, *sensors)
+
+    monkeypatch.setattr(Controller, "step", record)
+    physics = types.SimpleNamespace(MjData=mujoco.MjData, mj_step=mj_step)
+    example["main"].__globals__.update(SECONDS=0.02, mujoco=physics)
+    example["main"]()
+    scene = policy_scene(load_policy("spot"))
+    # The targets before a call are those of the last one, and at first the standing pose.
+    expected = [x + scene.stance.leg_trim for x in targets]
+    np.testing.assert_array_equal([x[scene.leg_ctrl] for x in commands], expected)
+    assert np.ptp(targets, axis=0).max() > 0
 
 
 def test_the_example_says_what_it_needs() -> None:
