@@ -390,6 +390,17 @@ def test_it_compiles_without_a_warning(name: str, flags: tuple[str, ...], tmp_pa
     compile_header(tmp_path / "real.h", tmp_path / "out", name, *flags)
 
 
+@pytest.mark.parametrize("name", ["gcc", "clang", "g++"])
+@pytest.mark.parametrize("flag", ["-Ofast", "-ffast-math", "-ffinite-math-only"])
+def test_it_refuses_flags_that_remove_its_checks(name: str, flag: str, tmp_path: Path) -> None:
+    """There a NaN is in every range."""
+    export_header(SHIPPED["best"], tmp_path / "policy.h", "0" * 16)
+    command = [compiler(name), flag, "-fsyntax-only", str(tmp_path / "policy.h")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "without -ffast-math" in done.stderr
+
+
 ALONE = '#include "policy.h"\nmjxb_controller controller;\n' + "".join(
     f"{kind} {name}({argument}); {kind} {name}({argument}) {{ {body}; }}\n"
     for kind, name, argument, body in (
