@@ -19,7 +19,7 @@ SENSORS = {"height": 0, "command": 1, "gyro": 2, "accelerometer": 2}
 """Where a row's samples are: foot heights, commands, IMU; 3 is a leaky mean."""
 ROW = """typedef struct {
     uint8_t sensor, index;
-    uint16_t lag, window, scale; /* scale: a row of mjxb_scales */
+    uint16_t lag, window, scale; /* lag: of a leaky mean, its place; scale: a row of mjxb_scales */
 } mjxb_row;
 """
 
@@ -154,7 +154,7 @@ def constants(model: Model) -> str:
     rows, scales = [], {}
     for k, row in enumerate(model.manifest["inputs"]):
         if k in slow:
-            places = (3, slow[k], 0, 1)
+            places = (3, 0, slow[k], 1)
         else:
             index = row["index"] + 3 * (row["sensor"] == "accelerometer")
             places = (SENSORS[row["sensor"]], index, row["lag"], row["window"])

@@ -144,6 +144,24 @@ def test_it_runs_any_layout(layout: str, tmp_path: Path, config: Config) -> None
     assert len(actions) > 4
 
 
+def test_it_runs_more_means_than_a_byte_counts(tmp_path: Path, config: Config) -> None:
+    """266 leaky means and angles, each with a time constant of its own."""
+    times = {
+        "mean_times": tuple(np.linspace(0.1, 5.0, 65).tolist()),
+        "filter_times": (0.5, 2.0, 4.0),
+    }
+    random_policy(tmp_path / "p", with_head(config, "radial", body_height=0.33, **times))
+    pair = Pair(tmp_path / "p", build(tmp_path / "p", tmp_path / "c"), False)
+    assert len(pair.python.model.inputs.slow) > 256
+    rng, actions = np.random.default_rng(1), set()
+    for _ in range(6 * pair.python.decision_samples):
+        imu = rng.normal((0, 0, 0, 0, 0, 9.81), (0.02, 0.02, 0.02, 0.2, 0.2, 0.2))
+        pair.step(pair.python.targets + rng.normal(0, 0.03, (4, 3)), imu[:3], imu[3:])
+        actions.add(pair.python.action)
+    assert pair.python.state is State.BALANCING
+    assert len(actions) > 2
+
+
 FAULTS = ("nan", "wide", "late", "stale", "lean", "fall", "stuck", "away", "tilt", "hot", "strain")
 SEGMENTS = st.tuples(
     st.sampled_from(("still", "still", "roll", "push", "shake", *FAULTS)),
