@@ -119,7 +119,7 @@ def peers() -> plt.Figure:
             library, _, algorithm = name.partition("-")
             text = f"ours, {name}" if name in OURS else f"{library} {algorithm.upper()}"
             labels.append((text, colour, time[-1], middle[-1]))
-        axis.set_xticks((5, 10, 20, 40, 60), ("5", "10", "20", "40", "60"))
+        axis.set_xticks((5, 10, 20, 40, 80, 150), ("5", "10", "20", "40", "80", "150"))
         axis.xaxis.set_minor_locator(NullLocator())
         axis.yaxis.set_major_formatter("{x:g}")
         if axis is axes[-1]:
