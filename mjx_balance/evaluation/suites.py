@@ -141,6 +141,11 @@ def find_suite(suite: str | Suite) -> Suite:
             f"platform of suite {suite.name} is True, but its motion is {quote(suite.motion)}; a "
             "platform moves with the sea alone: motion must be 'sea'"
         )
+    if suite.tilted and suite.motion in ("ramps", "steps"):
+        raise SuiteError(
+            f"tilted of suite {suite.name} is True, but its motion is {quote(suite.motion)}, which "
+            "is on its way when an episode starts; motion must be None or 'sea'"
+        )
     return suite
 
 

@@ -19,6 +19,7 @@ from mjx_balance.evaluation.suites import (
     Suite,
     SuiteError,
     draw_suite,
+    find_suite,
     standing_still,
 )
 from mjx_balance.robots.catalogue import Robot, find_robot
@@ -324,6 +325,11 @@ def test_a_suite_whose_ranges_contradict_is_refused(
 def test_a_platform_without_a_sea_is_refused(scene: Scene, motion: str | None) -> None:
     with pytest.raises(SuiteError, match=r"^platform of suite own is True, but .* must be 'sea'$"):
         suite_scene(scene, Suite(motion=motion, platform=True))
+
+
+def test_a_tilted_start_of_a_board_that_is_on_its_way_is_refused() -> None:
+    with pytest.raises(SuiteError, match=r"^tilted of suite own is True, but .* None or 'sea'$"):
+        find_suite(Suite(motion="steps", tilted=True))
 
 
 def test_no_seed_serves_two_purposes() -> None:
