@@ -122,6 +122,17 @@ def test_it_decides_as_the_runtime_with_every_policy(
     assert decisions >= 890 * scenarios
 
 
+def actions_of(pair: Pair, decisions: int) -> set[int]:
+    """The actions of both while they balance by random joints and samples."""
+    rng, actions = np.random.default_rng(1), set()
+    for _ in range(decisions * pair.python.decision_samples):
+        imu = rng.normal((0, 0, 0, 0, 0, 9.81), (0.02, 0.02, 0.02, 0.2, 0.2, 0.2))
+        pair.step(pair.python.targets + rng.normal(0, 0.03, (4, 3)), imu[:3], imu[3:])
+        actions.add(pair.python.action)
+    assert pair.python.state is State.BALANCING
+    return actions
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_it_runs_any_layout(layout: str, tmp_path: Path, config: Config) -> None:
     """Random weights, joints and samples; and names that C must not misread."""
@@ -135,13 +146,7 @@ def test_it_runs_any_layout(layout: str, tmp_path: Path, config: Config) -> None
     assert [library.name(1, k).decode() for k in range(3)] == names
     assert Controller(path).joints[1] == names
     pair = Pair(path, library, False)
-    rng, actions = np.random.default_rng(1), set()
-    for _ in range(24 * pair.python.decision_samples):
-        imu = rng.normal((0, 0, 0, 0, 0, 9.81), (0.02, 0.02, 0.02, 0.2, 0.2, 0.2))
-        pair.step(pair.python.targets + rng.normal(0, 0.03, (4, 3)), imu[:3], imu[3:])
-        actions.add(pair.python.action)
-    assert pair.python.state is State.BALANCING
-    assert len(actions) > 4
+    assert len(actions_of(pair, 24)) > 4
 
 
 def test_it_runs_more_means_than_a_byte_counts(tmp_path: Path, config: Config) -> None:
@@ -153,13 +158,7 @@ def test_it_runs_more_means_than_a_byte_counts(tmp_path: Path, config: Config) -
     random_policy(tmp_path / "p", with_head(config, "radial", body_height=0.33, **times))
     pair = Pair(tmp_path / "p", build(tmp_path / "p", tmp_path / "c"), False)
     assert len(pair.python.model.inputs.slow) > 256
-    rng, actions = np.random.default_rng(1), set()
-    for _ in range(6 * pair.python.decision_samples):
-        imu = rng.normal((0, 0, 0, 0, 0, 9.81), (0.02, 0.02, 0.02, 0.2, 0.2, 0.2))
-        pair.step(pair.python.targets + rng.normal(0, 0.03, (4, 3)), imu[:3], imu[3:])
-        actions.add(pair.python.action)
-    assert pair.python.state is State.BALANCING
-    assert len(actions) > 2
+    assert len(actions_of(pair, 6)) > 2
 
 
 FAULTS = ("nan", "wide", "late", "stale", "lean", "fall", "stuck", "away", "tilt", "hot", "strain")
